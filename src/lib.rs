@@ -1,0 +1,39 @@
+//! GAKP: GRU association and Kalman prediction for multiple object tracking, as a service.
+//!
+//! ```text
+//! camera -> frames -> detections -> embeddings -> link scores -> tracks -> subscribers
+//!   ingest     types     detect        embed          infer        track     publish, api
+//! ```
+//!
+//! [`types`], [`track`] and [`mot`] are pure: they know no clock, thread, file or model, and
+//! `cargo test --no-default-features` builds and tests them alone.
+
+pub mod types;
+
+#[cfg(feature = "ingest")]
+pub mod ingest;
+
+#[cfg(feature = "infer")]
+pub mod detect;
+#[cfg(feature = "infer")]
+pub mod embed;
+#[cfg(feature = "infer")]
+pub mod infer;
+
+pub mod track;
+
+#[cfg(feature = "service")]
+pub mod pipeline;
+
+#[cfg(feature = "service")]
+pub mod api;
+#[cfg(feature = "service")]
+pub mod publish;
+
+pub mod mot;
+
+#[cfg(feature = "learn")]
+pub mod learn;
+
+#[cfg(feature = "cli")]
+pub mod cli;

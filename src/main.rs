@@ -1,0 +1,2 @@
+//! The `gakp` binary.
+fn main() {}
