@@ -150,12 +150,7 @@ impl Hub {
     /// A hub whose reports name classes by `classes` (index = class).
     pub fn new(config: HubConfig, classes: Arc<[String]>) -> Self {
         let config = HubConfig { capacity: config.capacity.max(1), max_gaps: config.max_gaps.max(1) };
-        Self(Arc::new(Shared {
-            config,
-            classes,
-            mailboxes: Mutex::default(),
-            metrics: HubMetrics::new(),
-        }))
+        Self(Arc::new(Shared { config, classes, mailboxes: Mutex::default(), metrics: HubMetrics::new() }))
     }
 
     /// The names of classes.
@@ -246,7 +241,8 @@ impl Mailbox {
             ring.note_missing(&dropped.tracks);
             if ring.gaps.len() > hub.config.max_gaps {
                 hub.metrics.given_up.inc();
-                abandoned = Some(std::mem::replace(&mut *ring, Ring { end: Some(End::GivenUp), ..Ring::default() }));
+                abandoned =
+                    Some(std::mem::replace(&mut *ring, Ring { end: Some(End::GivenUp), ..Ring::default() }));
             }
         }
         drop(ring);

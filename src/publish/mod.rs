@@ -5,11 +5,15 @@
 //! A [`Report`] is encoded at most once per format, by the first subscriber that sends it, and the
 //! bytes are shared.
 
+mod draw;
 mod hub;
 mod json;
+mod picture;
 mod protobuf;
 mod report;
 
+pub use draw::{Trails, annotate, colour};
 pub use hub::{Event, Gap, Hub, HubConfig, HubMetrics, Only, Subscription};
+pub use picture::{PictureError, Rgb, RgbConverter};
 pub use protobuf::wire;
 pub use report::{Report, encode_gap_json, encode_gap_protobuf, encode_json, encode_protobuf};

@@ -94,7 +94,10 @@ mod tests {
         assert_eq!(frame.clock(), wire::Clock::Rtcp);
         assert_eq!((frame.width, frame.height, frame.ended), (640, 480, vec![1, 2]));
         let [first, second] = &frame.tracks[..] else { panic!("two tracks") };
-        assert_eq!((first.id, first.state(), first.class.as_str()), (3, wire::TrackState::Confirmed, "person"));
+        assert_eq!(
+            (first.id, first.state(), first.class.as_str()),
+            (3, wire::TrackState::Confirmed, "person")
+        );
         assert_eq!([first.x, first.y, first.w, first.h], [-1.5, 2.345_1, 30.0, 60.129]);
         assert_eq!((first.confidence, first.link, first.matched), (0.912_34, 0.5, true));
         assert_eq!((first.vx, first.vy), (-0.001, -12.345_1));
