@@ -165,11 +165,7 @@ pub(super) enum Reid {
 impl Plan {
     /// Checks the files that need no runtime first: a wrong hash is told even where ONNX Runtime is missing.
     pub(super) fn new(settings: &ModelSettings) -> Result<Self, InferError> {
-        let path = if settings.manifest.extension().is_some_and(|e| e == "toml") {
-            settings.manifest.clone()
-        } else {
-            settings.manifest.join("manifest.toml")
-        };
+        let path = manifest_path(settings);
         let manifest = Manifest::read(&path)?;
         let reid = match settings.reid.as_str() {
             "none" => Reid::None,
@@ -234,4 +230,28 @@ fn choose(manifest: &Manifest, task: Task, setting: &str) -> Result<Chosen, Infe
     };
     let file = own.verify(&entry)?;
     Ok(Chosen { entry, file })
+}
+
+impl Linker {
+    /// Loads the link scorer alone, for detections that are already there.
+    ///
+    /// # Errors
+    /// As [`Models::load`]; also when `settings.link` is `none`.
+    pub fn load(settings: &ModelSettings, observer: Arc<dyn Observer>) -> Result<Self, InferError> {
+        let manifest = Manifest::read(&manifest_path(settings))?;
+        let Chosen { entry, file } = choose(&manifest, Task::Link, &settings.link)?;
+        let folder = manifest.path().parent().unwrap_or(Path::new(""));
+        let runtime = Runtime::load(settings.provider, settings.onnxruntime.as_deref(), folder)?;
+        let arrangement = runtime.provider.arrangement(Task::Link, settings.threads);
+        Self::start(&runtime, &entry, &file, arrangement, observer)
+    }
+}
+
+/// The manifest's file.
+fn manifest_path(settings: &ModelSettings) -> PathBuf {
+    if settings.manifest.extension().is_some_and(|e| e == "toml") {
+        settings.manifest.clone()
+    } else {
+        settings.manifest.join("manifest.toml")
+    }
 }
