@@ -1,1 +1,4 @@
 //! cli
+
+#[cfg(feature = "testcam")]
+pub mod camera;
