@@ -13,6 +13,7 @@ use gstreamer::prelude::*;
 use gstreamer_app as gst_app;
 use gstreamer_video as gst_video;
 
+use super::decoder;
 use super::failure::{Failure, RTSP_TIMEOUT};
 use super::spec::{Pacing, SourceSpec, Transport};
 use super::url::{Location, Login};
@@ -283,7 +284,8 @@ impl Plug {
             pad.link(&after).map_err(internal)?;
             return Ok(());
         }
-        let decoder = self.decoder(&caps)?;
+        let decoder = decoder::create(&caps, self.software, self.threads, &self.avoid)?;
+        self.shared.facts().decoder = decoder.factory().map(|f| f.name().to_string());
         pipeline.add(&decoder).map_err(internal)?;
         let (Some(into), Some(out)) = (decoder.static_pad("sink"), decoder.static_pad("src")) else {
             return Err(internal("the decoder has no pads"));
@@ -331,41 +333,6 @@ impl Plug {
             skipping.store(false, Ordering::Relaxed);
             gst::PadProbeReturn::Ok
         });
-    }
-
-    /// The best decoder for these caps that this machine can bring up: hardware before software,
-    /// then by GStreamer's rank.
-    fn decoder(&self, caps: &gst::Caps) -> Result<gst::Element, Failure> {
-        let hardware = |f: &gst::ElementFactory| f.has_type(gst::ElementFactoryType::HARDWARE);
-        let mut found: Vec<gst::ElementFactory> =
-            gst::ElementFactory::factories_with_type(gst::ElementFactoryType::DECODER, gst::Rank::MARGINAL)
-                .into_iter()
-                .filter(|f| {
-                    f.can_sink_any_caps(caps)
-                        && f.can_src_any_caps(&gst::Caps::new_empty_simple("video/x-raw"))
-                })
-                .filter(|f| {
-                    !(self.software && hardware(f))
-                        && !self.avoid.iter().any(|name| f.name() == name.as_str())
-                })
-                .collect();
-        found.sort_by_key(|f| (!hardware(f), std::cmp::Reverse(f.rank()), f.name()));
-        for factory in &found {
-            let Ok(decoder) = factory.create().build() else { continue };
-            if hardware(factory) && decoder.set_state(gst::State::Ready).is_err() {
-                let _ = decoder.set_state(gst::State::Null);
-                continue;
-            }
-            if decoder.has_property("max-threads") {
-                decoder.set_property_from_str("max-threads", &self.threads.to_string());
-            }
-            self.shared.facts().decoder = Some(factory.name().to_string());
-            return Ok(decoder);
-        }
-        let name = caps.structure(0).map(|s| s.name().to_string()).unwrap_or_default();
-        Err(Failure::Unsupported(format!(
-            "no decoder for {name} is installed (Debian: gstreamer1.0-libav, gstreamer1.0-plugins-bad)"
-        )))
     }
 }
 

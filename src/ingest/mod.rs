@@ -12,12 +12,15 @@
 //! (then the decoder waits). Nothing else is dropped, but for damaged frames ([`SourceEvent::Corrupt`]).
 
 mod backoff;
+mod decoder;
 mod failure;
 mod graph;
 mod pattern;
 mod picture;
 mod source;
 mod spec;
+#[cfg(feature = "testcam")]
+pub mod testcam;
 mod timeline;
 mod url;
 mod writer;

@@ -315,6 +315,14 @@ impl<S: FnMut(SourceEvent) -> ControlFlow<()>> Source<S> {
                         self.spec.url.scrub(&format!("{} {}", w.error(), w.debug().unwrap_or_default()));
                     debug!(camera = %self.camera, "GStreamer warns: {text}");
                 }
+                // parsebin says here what it found; a stream it cannot link may end without a word.
+                gst::MessageView::StreamCollection(message) => {
+                    let kinds = gst::StreamType::VIDEO | gst::StreamType::UNKNOWN;
+                    let streams = message.stream_collection();
+                    if !streams.is_empty() && !streams.iter().any(|s| s.stream_type().intersects(kinds)) {
+                        return Some(End::Lost(Failure::Unsupported("there is no video in it".into())));
+                    }
+                }
                 gst::MessageView::Latency(_) => {
                     let _ = graph.pipeline.recalculate_latency();
                 }

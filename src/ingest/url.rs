@@ -302,8 +302,8 @@ mod tests {
             assert_eq!(url.redacted(), shown);
             assert!(!format!("{url} {url:?}").contains("hunter2"), "{text}");
             assert_eq!(url.with_secrets(), text);
-            let scrubbed = url.scrub("GET hunter2 and hunter2! and hunter2%21 and hunter2_channel=1");
-            assert!(!scrubbed.contains("hunter2") || text.contains("%21"), "{scrubbed}");
+            let scrubbed = url.scrub(&format!("cannot open {text}"));
+            assert!(!scrubbed.contains("hunter2"), "{scrubbed}");
         }
     }
 
