@@ -58,7 +58,7 @@ pub fn annotate(canvas: &mut Rgb, tracks: &FrameTracks, trails: &Trails) {
     }
     let scale =
         [canvas.width as f64 / f64::from(tracks.width), canvas.height as f64 / f64::from(tracks.height)];
-    let stroke = (canvas.height as i64 / 270).max(1);
+    let stroke = (canvas.height as i64 / 240).max(1);
     let mut pen = Pen { canvas, stroke, colour: [0; 3], dashed: false };
     for track in &tracks.tracks {
         let b = track.bbox;

@@ -43,17 +43,18 @@ impl Decoded {
 #[tokio::test]
 async fn a_snapshot_shows_the_newest_picture_with_boxes_or_without() {
     let server = gate().await;
-    for (seq, size, expected) in [(0, (320, 240), (320, 240)), (1, (3840, 2160), (1920, 1080))] {
+    for (seq, size, expected) in [(0, (1280, 960), (1280, 960)), (1, (3840, 2160), (1920, 1080))] {
         show(&server, seq, size);
         let annotated = server.get("/v1/cameras/gate/snapshot.jpg").await;
         assert!(annotated.head.contains("content-type: image/jpeg"), "{}", annotated.head);
         assert_eq!(Decoded::new(&annotated.body).size, expected);
         let plain = server.get("/v1/cameras/gate/snapshot.jpg?annotate=false").await;
         assert_eq!(Decoded::new(&plain.body).size, expected);
-        if size == (320, 240) {
+        if size == (1280, 960) {
             let (annotated, plain) = (Decoded::new(&annotated.body), Decoded::new(&plain.body));
-            // The plate of id 7 above the box's upper left corner; grey wall without it.
-            let plate = (83, 53);
+            // The plate of id 7 above the box's upper left corner (24 by 36 pixels, the lower left of
+            // the digit free); grey wall without it.
+            let plate = (84, 50);
             assert!(annotated.is(plate, colour(TrackId(7))), "the plate");
             assert!(plain.is(plate, [51; 3]) && !plain.is(plate, colour(TrackId(7))), "no plate");
             assert!(

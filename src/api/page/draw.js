@@ -34,7 +34,7 @@ export class Trails {
 export function annotate(context, report, trails) {
   const { width, height } = context.canvas;
   const [sx, sy] = [width / report.width, height / report.height];
-  const stroke = Math.max(1, Math.floor(height / 270));
+  const stroke = Math.max(1, Math.floor(height / 240));
   context.textBaseline = "top";
   context.font = `600 ${10 + 4 * stroke}px system-ui, sans-serif`;
   context.lineJoin = "round";
