@@ -58,13 +58,12 @@ pub fn annotate(canvas: &mut Rgb, tracks: &FrameTracks, trails: &Trails) {
     }
     let scale =
         [canvas.width as f64 / f64::from(tracks.width), canvas.height as f64 / f64::from(tracks.height)];
-    let stroke = (canvas.height as i64 / 270).max(1);
+    let stroke = (canvas.height as i64 / 240).max(1);
     let mut pen = Pen { canvas, stroke, colour: [0; 3], dashed: false };
     for track in &tracks.tracks {
         let b = track.bbox;
-        let corners = BBox::new(b.x * scale[0], b.y * scale[1], b.w * scale[0], b.h * scale[1]);
-        // A box far outside would only cost time; one that is no number has no place at all.
-        let Some(_) = corners.clipped(pen.canvas.width as f64, pen.canvas.height as f64) else { continue };
+        let b = BBox::new(b.x * scale[0], b.y * scale[1], b.w * scale[0], b.h * scale[1]);
+        let Some(corners) = pen.reachable(&b) else { continue };
         pen.colour = colour(track.id);
         pen.stroke = if track.state == TrackState::Tentative { 1 } else { stroke };
         pen.dashed = track.state != TrackState::Confirmed;
@@ -121,13 +120,22 @@ impl Pen<'_> {
         }
     }
 
+    /// A box with its edges moved to at most a little outside the canvas, so that huge boxes cost no
+    /// more than it; `None` when nothing of it is inside or it is no box.
+    fn reachable(&self, b: &BBox) -> Option<BBox> {
+        let (width, height) = (self.canvas.width as f64, self.canvas.height as f64);
+        b.clipped(width, height).filter(|_| b.is_valid())?;
+        let margin = 2.0 * self.stroke as f64;
+        let [x0, x1] = [b.x, b.right()].map(|v| v.clamp(-margin, width + margin));
+        let [y0, y1] = [b.y, b.bottom()].map(|v| v.clamp(-margin, height + margin));
+        Some(BBox::new(x0, y0, x1 - x0, y1 - y0))
+    }
+
     /// The outline of a box, the stroke on its inside.
     fn rectangle(&mut self, corners: &BBox) {
         let s = self.stroke;
-        // Edges outside are moved to just outside, so that huge boxes cost no more than the canvas.
-        let clamp = |v: f64, max: usize| (v.round() as i64).clamp(-s, max as i64 + s);
-        let (x0, x1) = (clamp(corners.x, self.canvas.width), clamp(corners.right(), self.canvas.width));
-        let (y0, y1) = (clamp(corners.y, self.canvas.height), clamp(corners.bottom(), self.canvas.height));
+        let [x0, x1] = [corners.x, corners.right()].map(|v| v.round() as i64);
+        let [y0, y1] = [corners.y, corners.bottom()].map(|v| v.round() as i64);
         let (dash, period) = if self.dashed { (DASH * s, 2 * DASH * s) } else { (i64::MAX, i64::MAX) };
         for x in (x0..x1).step_by(period as usize) {
             let end = x.saturating_add(dash).min(x1);
