@@ -15,7 +15,7 @@ pub mod train;
 use std::io::{self, IsTerminal};
 
 /// Point it at RTSP cameras, subscribe to tracks.
-#[derive(Clone, Debug, clap::Parser)]
+#[derive(Debug, clap::Parser)]
 #[command(name = "gakp", version)]
 pub struct Cli {
     /// What to do.
@@ -30,7 +30,7 @@ pub struct Cli {
 }
 
 /// Subcommands.
-#[derive(Clone, Debug, clap::Subcommand)]
+#[derive(Debug, clap::Subcommand)]
 pub enum Command {
     /// Run the service: cameras in, tracks out.
     #[cfg(feature = "service")]
