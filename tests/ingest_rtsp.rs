@@ -200,9 +200,11 @@ fn a_wrong_path_and_a_refused_port_are_told_apart() {
     for (url, expected) in [
         (format!("rtsp://{}/other", camera.address()), Failure::NotFound),
         (format!("rtsp://{free}/live"), Failure::Refused),
+        (format!("rtsps://{free}/live"), Failure::Refused),
+        (format!("http://{free}/live.mjpg"), Failure::Refused),
         ("rtsp://no-such-host.invalid/live".to_owned(), Failure::UnknownHost),
     ] {
-        let mut live = Live::start(spec(&url, Transport::Auto));
+        let mut live = Live::start(SourceSpec { insecure_tls: true, ..spec(&url, Transport::Auto) });
         let (reason, retry_in) = live.wait_lost();
         assert_eq!(reason, expected, "{url}");
         assert!(retry_in.unwrap() < Duration::from_secs(1), "{url}: {retry_in:?}");

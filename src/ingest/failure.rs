@@ -122,6 +122,8 @@ pub(crate) fn classify(error: &gst::glib::Error, debug: &str, url: &SourceUrl) -
             S::Decode | S::Demux | S::Format => Failure::Garbage(text()),
             // A demuxer that finds nothing it can pass on ("not-linked", "not-negotiated").
             S::Failed if says("not-negotiated") => Failure::Unsupported(text()),
+            // souphttpsrc says no more than this of a refused connection.
+            S::Failed => probe(url).unwrap_or(Failure::Other(text())),
             _ => Failure::Other(text()),
         };
     }

@@ -206,7 +206,7 @@ fn rtsp_source(
     source.set_property("add-reference-timestamp-meta", true);
     source.set_property("user-agent", concat!("gakp/", env!("CARGO_PKG_VERSION")));
     if spec.insecure_tls {
-        source.set_property_from_str("tls-validation-flags", "0");
+        source.set_property_from_str("tls-validation-flags", "no-flags");
     }
     // Video only: sound and metadata are not even set up.
     source.connect("select-stream", false, |args| {

@@ -270,17 +270,13 @@ impl<S: FnMut(SourceEvent) -> ControlFlow<()>> Source<S> {
                 return End::Stopped;
             }
             let asked = Instant::now();
-            match graph.sink.try_pull_sample(TICK) {
-                Some(sample) => {
-                    if self.deliver(&sample, graph, flow).is_break() {
-                        return End::Stopped;
-                    }
+            if let Some(sample) = graph.sink.try_pull_sample(TICK) {
+                if self.deliver(&sample, graph, flow).is_break() {
+                    return End::Stopped;
                 }
-                // The sink is not running (yet, or any more): do not spin.
-                None if asked.elapsed() < Duration::from_millis(2) => {
-                    std::thread::sleep(Duration::from_millis(2))
-                }
-                None => {}
+            } else if asked.elapsed() < Duration::from_millis(2) {
+                // The appsink is not running (yet, or any more): do not spin.
+                std::thread::sleep(Duration::from_millis(2));
             }
             if let Some(end) = self.look_around(&bus, graph, flow) {
                 return end;
