@@ -80,8 +80,69 @@ fn other_codecs_are_transcoded_and_b_frames_kept_in_order() {
     );
     for (name, clip) in [("jpeg", jpeg), ("b frames", b_frames)] {
         let camera = TestCamera::start(once(&clip)).unwrap();
-        let (seen, _) = until_lost(tcp(&camera));
-        assert_eq!(seen.indices(), indices(50), "{name}");
+        for transport in [Transport::Tcp, Transport::Udp] {
+            let (seen, _) = until_lost(spec(&camera.url(), transport));
+            assert_eq!(seen.indices(), indices(50), "{name} {transport:?}");
+        }
+    }
+}
+
+#[test]
+fn auto_finds_the_transport_and_a_fixed_one_is_kept() {
+    let clip = Clip::numbered(50, 25.0);
+    for offered in [Transport::Tcp, Transport::Udp] {
+        let camera =
+            TestCamera::start(TestCameraConfig { transport: offered, ..TestCameraConfig::new(clip.path()) })
+                .unwrap();
+        let mut live = Live::start(spec(&camera.url(), Transport::Auto));
+        let opened = live.wait("opening", |e| match e {
+            SourceEvent::Opened(opened) => Some(opened.clone()),
+            _ => None,
+        });
+        assert_eq!(opened.transport, Some(offered));
+        live.stop();
+        let other = if offered == Transport::Tcp { Transport::Udp } else { Transport::Tcp };
+        let mut live = Live::start(spec(&camera.url(), other));
+        for _ in 0..2 {
+            assert_eq!(live.wait_lost().0, Failure::Transport, "{offered:?}");
+        }
+        live.stop();
+    }
+}
+
+#[test]
+fn when_decoding_falls_behind_whole_groups_are_skipped_and_counted() {
+    let clip = Clip::numbered(240, 60.0).through(
+        ".mp4",
+        "qtdemux ! avdec_h264 ! x264enc key-int-max=20 bframes=0 pass=qual quantizer=18 ! h264parse ! mp4mux",
+    );
+    let camera = TestCamera::start(once(&clip)).unwrap();
+    // 10 frames a second of 60; the queue of decoded frames is full at once, then the decoder waits.
+    let (mut live, mut seen, mut skipped) =
+        (Live::start_slow(tcp(&camera), Duration::from_millis(100)), Recorder::default(), 0);
+    let reason = loop {
+        match live.next().unwrap() {
+            SourceEvent::Skipped { frames } => skipped += frames,
+            SourceEvent::Lost { reason, .. } => break reason,
+            event => seen.add(event),
+        }
+    };
+    live.stop();
+    assert_eq!(reason, Failure::Disconnected);
+    assert!(skipped > 50, "{skipped}");
+    assert_eq!(seen.events.iter().filter(|e| matches!(e, SourceEvent::Corrupt)).count(), 0);
+    assert_eq!(seen.indices().len() as u64 + skipped, 240);
+    // After a hole comes a key frame: every 20th.
+    let times: Vec<f64> = seen.frames().map(|f| f.time.since(Default::default())).collect();
+    for (pair, index) in times.windows(2).zip(&seen.indices()[1..]) {
+        assert!(pair[1] - pair[0] < 0.1 || index % 10 == 0, "{index} after {} s", pair[1] - pair[0]);
+    }
+    for frame in seen.frames().filter(|f| f.capture.clock == Clock::Arrival) {
+        let wall = std::time::SystemTime::now() - frame.decoded.elapsed();
+        let age =
+            wall.duration_since(std::time::UNIX_EPOCH).unwrap().as_nanos() as i64 - frame.capture.unix_ns;
+        // 2 s in the queue, the frames that were decoded already, and a loaded machine.
+        assert!(age < 4_000_000_000, "{age} ns old");
     }
 }
 
@@ -139,9 +200,11 @@ fn a_wrong_path_and_a_refused_port_are_told_apart() {
     for (url, expected) in [
         (format!("rtsp://{}/other", camera.address()), Failure::NotFound),
         (format!("rtsp://{free}/live"), Failure::Refused),
+        (format!("rtsps://{free}/live"), Failure::Refused),
+        (format!("http://{free}/live.mjpg"), Failure::Refused),
         ("rtsp://no-such-host.invalid/live".to_owned(), Failure::UnknownHost),
     ] {
-        let mut live = Live::start(spec(&url, Transport::Auto));
+        let mut live = Live::start(SourceSpec { insecure_tls: true, ..spec(&url, Transport::Auto) });
         let (reason, retry_in) = live.wait_lost();
         assert_eq!(reason, expected, "{url}");
         assert!(retry_in.unwrap() < Duration::from_secs(1), "{url}: {retry_in:?}");

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use anyhow::{Context, bail};
 use clap::ValueEnum;
 
+use crate::ingest::Transport;
 use crate::ingest::testcam::{Codec, TestCamera, TestCameraConfig};
 
 /// Serve a video over RTSP, looping, as if it were a camera.
@@ -60,6 +61,7 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         }),
         fps: args.fps,
         looped: !args.no_loop,
+        transport: Transport::Auto,
     })?;
     println!("{}", camera.url());
     eprintln!("serving {} frames of {:?}; Ctrl-C ends it", camera.frames(), camera.codec());

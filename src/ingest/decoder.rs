@@ -23,7 +23,8 @@ pub(crate) fn create(
     let mut found: Vec<gst::ElementFactory> = all
         .into_iter()
         .filter(|f| f.can_sink_any_caps(caps) && f.can_src_any_caps(&raw))
-        .filter(|f| !(software && hardware(f)) && !avoid.iter().any(|name| f.name() == name.as_str()))
+        .filter(|f| !(software && hardware(f)))
+        .filter(|f| avoid.iter().all(|name| f.name() != name.as_str()))
         .collect();
     found.sort_by_key(|f| (!hardware(f), Reverse(f.rank()), f.name()));
     for factory in &found {

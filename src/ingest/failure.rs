@@ -34,6 +34,9 @@ pub enum Failure {
     /// The other side closed the connection.
     #[error("disconnected by the other side")]
     Disconnected,
+    /// The camera has no video over this transport.
+    #[error("no video over this transport: try the other one (TCP, UDP), and check that the path has video")]
+    Transport,
     /// It is no video, or one that cannot be decoded here.
     #[error("unsupported: {0}")]
     Unsupported(String),
@@ -57,6 +60,7 @@ impl Failure {
             Self::Busy => "busy",
             Self::Silent(_) => "silent",
             Self::Disconnected => "disconnected",
+            Self::Transport => "transport",
             Self::Unsupported(_) => "unsupported",
             Self::Garbage(_) => "garbage",
             Self::Other(_) => "other",
@@ -64,7 +68,7 @@ impl Failure {
     }
 
     /// Every label, for metrics that start at 0.
-    pub const LABELS: [&'static str; 11] = [
+    pub const LABELS: [&'static str; 12] = [
         "refused",
         "unknown_host",
         "unreachable",
@@ -73,6 +77,7 @@ impl Failure {
         "busy",
         "silent",
         "disconnected",
+        "transport",
         "unsupported",
         "garbage",
         "other",
@@ -112,10 +117,13 @@ pub(crate) fn classify(error: &gst::glib::Error, debug: &str, url: &SourceUrl) -
         use gst::StreamError as S;
         return match kind {
             S::WrongType | S::TypeNotFound => Failure::Unsupported("this is not a video".into()),
+            S::CodecNotFound if says("transport protocols") => Failure::Transport,
             S::CodecNotFound => Failure::Unsupported(text()),
             S::Decode | S::Demux | S::Format => Failure::Garbage(text()),
             // A demuxer that finds nothing it can pass on ("not-linked", "not-negotiated").
             S::Failed if says("not-negotiated") => Failure::Unsupported(text()),
+            // souphttpsrc says no more than this of a refused connection.
+            S::Failed => probe(url).unwrap_or(Failure::Other(text())),
             _ => Failure::Other(text()),
         };
     }
@@ -172,6 +180,7 @@ mod tests {
             Failure::Busy,
             Failure::Silent(Duration::ZERO),
             Failure::Disconnected,
+            Failure::Transport,
             Failure::Unsupported(String::new()),
             Failure::Garbage(String::new()),
             Failure::Other(String::new()),

@@ -13,16 +13,12 @@ use gstreamer::prelude::*;
 use gstreamer_app as gst_app;
 use gstreamer_video as gst_video;
 
+use super::backlog;
 use super::decoder;
 use super::failure::{Failure, RTSP_TIMEOUT};
 use super::spec::{Pacing, SourceSpec, Transport};
 use super::url::{Location, Login};
 
-/// Encoded frames that wait for a camera's decoder; beyond it they are skipped up to the next key
-/// frame, so that the age of what is decoded stays bounded on an overloaded machine.
-const BACKLOG_FRAMES: u32 = 200;
-/// The same, as time.
-const BACKLOG_TIME: gst::ClockTime = gst::ClockTime::from_seconds(2);
 /// Decoded frames that wait for the sink; then the decoder waits.
 const DECODED_FRAMES: u32 = 3;
 
@@ -68,8 +64,13 @@ impl Shared {
         self.facts().failure.get_or_insert(failure);
     }
 
+    /// When the graph was built.
+    pub fn started(&self) -> Instant {
+        self.started
+    }
+
     /// Marks that encoded data came.
-    fn data_arrived(&self) {
+    pub fn data_arrived(&self) {
         let ms = self.started.elapsed().as_millis() as u64;
         self.last_data_ms.store(ms.max(1), Ordering::Relaxed);
     }
@@ -78,6 +79,11 @@ impl Shared {
     pub fn last_data(&self) -> Option<Instant> {
         let ms = self.last_data_ms.load(Ordering::Relaxed);
         (ms > 0).then(|| self.started + std::time::Duration::from_millis(ms))
+    }
+
+    /// Counts an encoded frame that will not be decoded.
+    pub fn skip_one(&self) {
+        self.skipped.fetch_add(1, Ordering::Relaxed);
     }
 
     /// Encoded frames skipped since the last call.
@@ -120,7 +126,7 @@ pub(crate) fn build(spec: &SourceSpec, transport: Transport, avoid: &[String]) -
         Location::Rtsp { uri, login, .. } => {
             let source = rtsp_source(spec, uri, login.as_ref(), transport)?;
             pipeline.add(&source).map_err(internal)?;
-            parse_pads_of(&pipeline, &source, plug);
+            depayload_pads_of(&pipeline, &source, plug);
         }
         Location::Http { uri, login, .. } => {
             let source = make("urisourcebin")?;
@@ -190,7 +196,9 @@ fn rtsp_source(
     let udp = transport == Transport::Udp;
     source.set_property_from_str("protocols", if udp { "udp" } else { "tcp" });
     source.set_property("latency", spec.latency.as_millis() as u32);
-    source.set_property("drop-on-latency", udp);
+    // "drop-on-latency" would throw away packets that are in time when B frames or a burst at the start
+    // spread the time stamps; nothing behind the jitter buffer blocks it, so it stays short anyway.
+    source.set_property("drop-on-latency", false);
     source.set_property("tcp-timeout", RTSP_TIMEOUT.as_micros() as u64);
     source.set_property("timeout", RTSP_TIMEOUT.as_micros() as u64);
     source.set_property("udp-buffer-size", 2 << 20);
@@ -198,7 +206,7 @@ fn rtsp_source(
     source.set_property("add-reference-timestamp-meta", true);
     source.set_property("user-agent", concat!("gakp/", env!("CARGO_PKG_VERSION")));
     if spec.insecure_tls {
-        source.set_property_from_str("tls-validation-flags", "0");
+        source.set_property_from_str("tls-validation-flags", "no-flags");
     }
     // Video only: sound and metadata are not even set up.
     source.connect("select-stream", false, |args| {
@@ -220,27 +228,59 @@ fn parse(pipeline: &gst::Pipeline, source: &gst::Element, plug: Plug) -> Result<
     Ok(())
 }
 
-/// The same for a source whose pads come later; only the first is used.
-fn parse_pads_of(pipeline: &gst::Pipeline, source: &gst::Element, plug: Plug) {
+/// The same for RTP, whose pads come later; only the first is used.
+fn depayload_pads_of(pipeline: &gst::Pipeline, source: &gst::Element, plug: Plug) {
     let (weak, shared) = (pipeline.downgrade(), plug.shared.clone());
     let plug = Mutex::new(Some(plug));
     source.connect_pad_added(move |_, pad| {
         let Some(pipeline) = weak.upgrade() else { return };
         let Some(plug) = plug.lock().ok().and_then(|mut plug| plug.take()) else { return };
-        let linked = make("parsebin").and_then(|parser| {
-            pipeline.add(&parser).map_err(internal)?;
-            plug.take_pads_of(&parser);
-            let sink = parser.static_pad("sink").ok_or_else(|| internal("parsebin has no sink"))?;
-            pad.link(&sink).map_err(internal)?;
-            parser.sync_state_with_parent().map_err(internal)
-        });
-        if let Err(failure) = linked {
+        if let Err(failure) = depayload(&pipeline, pad, plug) {
             shared.fail(failure);
         }
     });
 }
 
+/// Adds `depayloader ! parsebin`.
+///
+/// parsebin could find the depayloader itself, but would ask it for single NAL units; then the parser
+/// knows only by the next frame that one is complete, and everything comes a frame late.
+fn depayload(pipeline: &gst::Pipeline, pad: &gst::Pad, plug: Plug) -> Result<(), Failure> {
+    let caps = pad.current_caps().unwrap_or_else(|| pad.query_caps(None));
+    let encoding = caps.structure(0).and_then(|s| s.get::<String>("encoding-name").ok()).unwrap_or_default();
+    let kind = gst::ElementFactoryType::DEPAYLOADER;
+    let mut found: Vec<_> = gst::ElementFactory::factories_with_type(kind, gst::Rank::MARGINAL)
+        .into_iter()
+        .filter(|f| f.can_sink_any_caps(&caps))
+        .collect();
+    found.sort_by_key(|f| (std::cmp::Reverse(f.rank()), f.name()));
+    let depayloader = found
+        .iter()
+        .find_map(|f| f.create().build().ok())
+        .ok_or_else(|| Failure::Unsupported(format!("nothing here reads {encoding} from RTP")))?;
+    let parser = make("parsebin")?;
+    pipeline.add_many([&depayloader, &parser]).map_err(internal)?;
+    let whole_frames = match encoding.as_str() {
+        "H264" => Some("video/x-h264"),
+        "H265" => Some("video/x-h265"),
+        _ => None,
+    };
+    match whole_frames {
+        Some(name) => {
+            let caps = gst::Caps::builder(name).field("alignment", "au").build();
+            depayloader.link_filtered(&parser, &caps).map_err(internal)?;
+        }
+        None => depayloader.link(&parser).map_err(internal)?,
+    }
+    plug.take_pads_of(&parser);
+    let sink = depayloader.static_pad("sink").ok_or_else(|| internal("the depayloader has no sink"))?;
+    pad.link(&sink).map_err(internal)?;
+    // link_filtered has put a capsfilter between them.
+    pipeline.sync_children_states().map_err(internal)
+}
+
 /// Puts the decoder between the first video pad of a parser and the appsink.
+#[derive(Clone)]
 struct Plug {
     pipeline: gst::glib::WeakRef<gst::Pipeline>,
     convert: gst::glib::WeakRef<gst::Element>,
@@ -272,15 +312,17 @@ impl Plug {
             return Ok(());
         };
         let caps = pad.current_caps().unwrap_or_else(|| pad.query_caps(None));
-        let Some(name) = caps.structure(0).map(|s| s.name().to_string()) else { return Ok(()) };
+        let Some(name) = caps.structure(0).map(|s| s.name().to_string()) else {
+            return self.take_later(&pipeline, pad);
+        };
         if !(name.starts_with("video/") || name.starts_with("image/")) || self.shared.facts().codec.is_some()
         {
-            return Ok(());
+            return discard(&pipeline, pad);
         }
         self.shared.facts().codec = Some(codec_name(&caps, &name));
         let after = convert.static_pad("sink").ok_or_else(|| internal("videoconvert has no sink"))?;
         if name == "video/x-raw" {
-            self.watch(pad, None);
+            self.watch(pad);
             pad.link(&after).map_err(internal)?;
             return Ok(());
         }
@@ -300,40 +342,53 @@ impl Plug {
             pipeline.add(&queue).map_err(internal)?;
             queue.link(&decoder).map_err(internal)?;
             let entry = queue.static_pad("sink").ok_or_else(|| internal("queue has no sink"))?;
-            self.watch(&entry, Some(queue.downgrade()));
+            backlog::guard(&queue, &self.shared).ok_or_else(|| internal("queue has no pads"))?;
             decoder.sync_state_with_parent().map_err(internal)?;
             queue.sync_state_with_parent().map_err(internal)?;
             pad.link(&entry).map_err(internal)?;
         } else {
-            self.watch(&into, None);
+            self.watch(&into);
             decoder.sync_state_with_parent().map_err(internal)?;
             pad.link(&into).map_err(internal)?;
         }
         Ok(())
     }
 
-    /// Notes that data come, and keeps the backlog before a camera's decoder bounded.
-    fn watch(&self, pad: &gst::Pad, queue: Option<gst::glib::WeakRef<gst::Element>>) {
+    /// A pad that does not say yet what it carries (HLS): a further parser will.
+    fn take_later(&self, pipeline: &gst::Pipeline, pad: &gst::Pad) -> Result<(), Failure> {
+        let kinds = gst::StreamType::VIDEO | gst::StreamType::UNKNOWN;
+        if pad.stream().is_some_and(|stream| !stream.stream_type().intersects(kinds)) {
+            return discard(pipeline, pad);
+        }
+        let parser = make("parsebin")?;
+        pipeline.add(&parser).map_err(internal)?;
+        self.clone().take_pads_of(&parser);
+        parser.sync_state_with_parent().map_err(internal)?;
+        let entry = parser.static_pad("sink").ok_or_else(|| internal("parsebin has no sink"))?;
+        pad.link(&entry).map_err(internal)?;
+        Ok(())
+    }
+
+    /// Notes that data come.
+    fn watch(&self, pad: &gst::Pad) {
         let shared = self.shared.clone();
-        let skipping = std::sync::atomic::AtomicBool::new(false);
-        pad.add_probe(gst::PadProbeType::BUFFER, move |_, info| {
+        pad.add_probe(gst::PadProbeType::BUFFER, move |_, _| {
             shared.data_arrived();
-            let Some(queue) = queue.as_ref().and_then(|queue| queue.upgrade()) else {
-                return gst::PadProbeReturn::Ok;
-            };
-            let behind = queue.property::<u32>("current-level-buffers") >= BACKLOG_FRAMES
-                || queue.property::<u64>("current-level-time") >= BACKLOG_TIME.nseconds();
-            let key =
-                info.buffer().is_some_and(|buffer| !buffer.flags().contains(gst::BufferFlags::DELTA_UNIT));
-            if behind || (skipping.load(Ordering::Relaxed) && !key) {
-                skipping.store(true, Ordering::Relaxed);
-                shared.skipped.fetch_add(1, Ordering::Relaxed);
-                return gst::PadProbeReturn::Drop;
-            }
-            skipping.store(false, Ordering::Relaxed);
             gst::PadProbeReturn::Ok
         });
     }
+}
+
+/// Sound and further streams go nowhere; some sources fail if they cannot get rid of them.
+fn discard(pipeline: &gst::Pipeline, pad: &gst::Pad) -> Result<(), Failure> {
+    let sink = make("fakesink")?;
+    sink.set_property("async", false);
+    sink.set_property("sync", false);
+    pipeline.add(&sink).map_err(internal)?;
+    sink.sync_state_with_parent().map_err(internal)?;
+    let entry = sink.static_pad("sink").ok_or_else(|| internal("fakesink has no sink"))?;
+    pad.link(&entry).map_err(internal)?;
+    Ok(())
 }
 
 /// `h264`, `h265`, `jpeg`, `mpeg4`, ...
@@ -370,7 +425,7 @@ fn make(name: &str) -> Result<gst::Element, Failure> {
 pub(crate) fn package_of(element: &str) -> &'static str {
     match element {
         "rtspsrc" | "v4l2src" | "souphttpsrc" | "qtdemux" => "gstreamer1.0-plugins-good",
-        "h264parse" | "h265parse" | "x265enc" => "gstreamer1.0-plugins-bad",
+        "h264parse" | "h265parse" | "x265enc" | "openh264enc" => "gstreamer1.0-plugins-bad",
         "x264enc" => "gstreamer1.0-plugins-ugly",
         _ => "gstreamer1.0-plugins-base",
     }

@@ -4,13 +4,17 @@
 //! everything else that happens, to a sink. A camera is reconnected for ever.
 //!
 //! ```text
-//! rtspsrc | urisourcebin | filesrc | v4l2src -> parsebin -> [queue] -> decoder -> videoconvert -> appsink -> sink
+//! rtspsrc -> depayloader \
+//! urisourcebin, filesrc, v4l2src -> parsebin -> [queue] -> decoder -> videoconvert -> appsink -> sink
+//! videotestsrc ---------------------------------------------------^
 //! ```
 //!
-//! Queues, all bounded: 2 s or 200 frames of encoded video before a camera's decoder (then skipped up
-//! to the next key frame and reported as [`SourceEvent::Skipped`]), 3 decoded frames before the sink
-//! (then the decoder waits). Nothing else is dropped, but for damaged frames ([`SourceEvent::Corrupt`]).
+//! Queues, all bounded: encoded video before a camera's decoder, at most 2 s old and 200 frames (then
+//! skipped up to the next key frame and reported as [`SourceEvent::Skipped`]); 3 decoded frames before
+//! the sink (then the decoder waits). Nothing else is dropped, but for damaged frames
+//! ([`SourceEvent::Corrupt`]) and, over UDP, packets that come too late.
 
+mod backlog;
 mod backoff;
 mod decoder;
 mod failure;

@@ -11,6 +11,7 @@ use gstreamer::prelude::*;
 use gstreamer_video as gst_video;
 use tracing::{debug, info, warn};
 
+use super::backlog;
 use super::backoff::Backoff;
 use super::failure::{self, Failure};
 use super::graph::{self, Graph};
@@ -117,8 +118,8 @@ impl Drop for SourceHandle {
 /// Opens a source on a thread named `cam-<name>` and calls `sink` there for everything that happens,
 /// until it breaks, the handle stops it, or a source that is played once ends.
 ///
-/// A sink of a camera must be quick: while it works, frames wait in the pipeline (3 decoded, then 2 s
-/// of encoded ones, then they are skipped and reported). A sink of a file may block: the file waits.
+/// A sink of a camera must be quick: while it works, frames wait in the pipeline (3 decoded, then
+/// encoded ones for 2 s, then those are skipped and reported). A sink of a file may block: the file waits.
 pub fn start(
     name: &CameraId,
     spec: SourceSpec,
@@ -247,7 +248,7 @@ impl<S: FnMut(SourceEvent) -> ControlFlow<()>> Source<S> {
     /// `Auto` is TCP, and UDP by turns where TCP has never brought a frame although the camera answers.
     fn switch_transport(&mut self, reason: &Failure, frames: u64) {
         self.proven |= frames > 0;
-        let answers = matches!(reason, Failure::Silent(_) | Failure::Other(_) | Failure::Garbage(_));
+        let answers = matches!(reason, Failure::Silent(_) | Failure::Transport);
         if self.spec.transport == Transport::Auto && !self.proven && answers {
             self.transport = if self.transport == Transport::Tcp { Transport::Udp } else { Transport::Tcp };
         }
@@ -269,18 +270,13 @@ impl<S: FnMut(SourceEvent) -> ControlFlow<()>> Source<S> {
                 return End::Stopped;
             }
             let asked = Instant::now();
-            match graph.sink.try_pull_sample(TICK) {
-                Some(sample) => {
-                    if self.deliver(&sample, graph, flow).is_break() {
-                        return End::Stopped;
-                    }
-                    continue;
+            if let Some(sample) = graph.sink.try_pull_sample(TICK) {
+                if self.deliver(&sample, graph, flow).is_break() {
+                    return End::Stopped;
                 }
-                // The sink is not running (yet, or any more): do not spin.
-                None if asked.elapsed() < Duration::from_millis(2) => {
-                    std::thread::sleep(Duration::from_millis(2))
-                }
-                None => {}
+            } else if asked.elapsed() < Duration::from_millis(2) {
+                // The appsink is not running (yet, or any more): do not spin.
+                std::thread::sleep(Duration::from_millis(2));
             }
             if let Some(end) = self.look_around(&bus, graph, flow) {
                 return end;
@@ -396,25 +392,28 @@ impl<S: FnMut(SourceEvent) -> ControlFlow<()>> Source<S> {
     fn deliver(&mut self, sample: &gst::Sample, graph: &Graph, flow: &mut Flow) -> ControlFlow<()> {
         let decoded = Instant::now();
         let wall = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_nanos() as i64);
-        flow.last = Some(decoded);
         let Some(buffer) = sample.buffer_owned() else { return ControlFlow::Continue(()) };
         let Some(info) = flow.info(sample) else { return (self.sink)(SourceEvent::Corrupt) };
         if buffer.flags().contains(gst::BufferFlags::CORRUPTED) {
             return (self.sink)(SourceEvent::Corrupt);
         }
+        // From the arrival of the encoded frame to now, where that is known.
+        let arrived = backlog::arrival(&buffer, graph.shared.started());
+        let decoding = arrived.map_or(Duration::ZERO, |at| decoded.saturating_duration_since(at));
         let (pts, rtcp) = (buffer.pts().map(gst::ClockTime::nseconds), picture::rtcp_time(&buffer));
         let Some(image) = picture::image(buffer, &info) else { return (self.sink)(SourceEvent::Corrupt) };
         if flow.frames == 0 {
             self.open(&info, graph, flow)?;
         }
         flow.frames += 1;
+        flow.last = Some(decoded);
         let time = self.line.place(pts, decoded);
         let capture = match rtcp.filter(|ns| (ns - wall).abs() < CLOCK_SANITY_NS) {
             _ if !self.spec.is_live() && self.spec.pacing == Pacing::AsFastAsPossible => {
                 CaptureTime { unix_ns: time.0, clock: Clock::Media }
             }
             Some(unix_ns) => CaptureTime { unix_ns, clock: Clock::Rtcp },
-            None => CaptureTime { unix_ns: wall, clock: Clock::Arrival },
+            None => CaptureTime { unix_ns: wall - decoding.as_nanos() as i64, clock: Clock::Arrival },
         };
         let delivered = (self.sink)(SourceEvent::Frame(RawFrame { image, time, capture, decoded }));
         // A sink that blocks is no silence of the source.

@@ -166,7 +166,7 @@ impl Live {
         Self::start_slow(spec, Duration::ZERO)
     }
 
-    fn start_slow(spec: SourceSpec, nap: Duration) -> Self {
+    pub fn start_slow(spec: SourceSpec, nap: Duration) -> Self {
         let (sender, events) = mpsc::sync_channel(1000);
         let handle = start(&id("test"), spec, move |event| {
             std::thread::sleep(nap);

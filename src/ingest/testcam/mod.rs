@@ -21,6 +21,8 @@ use gstreamer_rtsp_server::prelude::*;
 use feed::Feeds;
 use footage::Footage;
 
+use super::Transport;
+
 /// What a test camera sends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Codec {
@@ -56,6 +58,8 @@ pub struct TestCameraConfig {
     pub fps: Option<f64>,
     /// Begin again at the end, for ever; otherwise the stream ends.
     pub looped: bool,
+    /// What RTP may travel by; `Auto` is what the client asks for.
+    pub transport: Transport,
 }
 
 impl TestCameraConfig {
@@ -69,6 +73,7 @@ impl TestCameraConfig {
             codec: None,
             fps: None,
             looped: true,
+            transport: Transport::Auto,
         }
     }
 }
@@ -146,6 +151,11 @@ impl TestCamera {
         server.set_service(&config.listen.port().to_string());
         let feeds = Arc::new(Feeds::default());
         let factory = factory(footage, config.looped, feeds.clone());
+        match config.transport {
+            Transport::Auto => {}
+            Transport::Tcp => factory.set_protocols(rtsp::gst_rtsp::RTSPLowerTrans::TCP),
+            Transport::Udp => factory.set_protocols(rtsp::gst_rtsp::RTSPLowerTrans::UDP),
+        }
         if let Some((user, password)) = &config.login {
             require_login(&server, &factory, user, password);
         }
