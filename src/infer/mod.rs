@@ -2,6 +2,7 @@
 //! cameras share, the link scorer. [`Models::load`] makes all of it.
 
 mod batcher;
+pub mod bench;
 mod error;
 mod graph;
 mod linker;

@@ -231,3 +231,144 @@ fn convert_row(matrix: &ColourMatrix, planes: [&[u8]; 3], channels: [&mut [f32];
     }
     convert(matrix, planes, channels);
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::types::Plane;
+
+    /// A picture with a smooth pattern, rows longer than the picture, and the last row cut off.
+    fn picture(width: u32, height: u32, range: YuvRange, matrix: YuvMatrix) -> Image {
+        let mut bytes = vec![];
+        let planes = [
+            (width, height, 7),
+            (width.div_ceil(2), height.div_ceil(2), 5),
+            (width.div_ceil(2), height.div_ceil(2), 3),
+        ]
+        .map(|(w, h, extra)| {
+            let plane = Plane { offset: bytes.len(), stride: w as usize + extra };
+            for y in 0..h {
+                for x in 0..w {
+                    let (x, y) = (f64::from(x), f64::from(y));
+                    let wave = (x * 0.21 + extra as f64).sin() * 60.0 + (y * 0.17).cos() * 50.0;
+                    bytes.push((128.0 + wave) as u8);
+                }
+                if y + 1 < h {
+                    bytes.extend(vec![255; extra]);
+                }
+            }
+            plane
+        });
+        Image::i420((width, height), range, matrix, planes, Arc::new(bytes)).expect("a picture")
+    }
+
+    /// A plane at output pixel `(i, j)` by a triangle filter, as wide as the picture shrinks if that is much.
+    fn sample(
+        image: &Image,
+        index: usize,
+        from: BBox,
+        (w, h): (usize, usize),
+        (i, j): (usize, usize),
+    ) -> f64 {
+        let (bytes, stride) = image.plane(index);
+        let (plane_w, plane_h) = image.plane_size(index);
+        let part = if index == 0 { 1.0 } else { 0.5 };
+        let (sx, sy) = (from.w * part / w as f64, from.h * part / h as f64);
+        let wide = sx.max(sy) > INTERPOLATE_UP_TO;
+        let weights = |start: f64, scale: f64, out: usize, size: usize| {
+            let centre = start + (out as f64 + 0.5) * scale;
+            let support = if wide { scale.max(1.0) } else { 1.0 };
+            let raw: Vec<f64> =
+                (0..size).map(|x| (1.0 - (x as f64 + 0.5 - centre).abs() / support).max(0.0)).collect();
+            let sum: f64 = raw.iter().sum();
+            raw.into_iter().map(move |w| w / sum).collect::<Vec<f64>>()
+        };
+        let across = weights(from.x * part, sx, i, plane_w);
+        let down = weights(from.y * part, sy, j, plane_h);
+        let mut sum = 0.0;
+        for (y, wy) in down.iter().enumerate().filter(|(_, w)| **w > 0.0) {
+            for (x, wx) in across.iter().enumerate().filter(|(_, w)| **w > 0.0) {
+                sum += wx * wy * f64::from(bytes[y * stride + x]);
+            }
+        }
+        sum
+    }
+
+    /// Red, green, blue by the textbook.
+    fn rgb(image: &Image, y: f64, u: f64, v: f64) -> [f64; 3] {
+        let (kr, kb) = if image.matrix == YuvMatrix::Bt601 { (0.299, 0.114) } else { (0.2126, 0.0722) };
+        let (y, cb, cr) = match image.range {
+            YuvRange::Full => (y, u - 128.0, v - 128.0),
+            YuvRange::Limited => {
+                ((y - 16.0) * 255.0 / 219.0, (u - 128.0) * 255.0 / 224.0, (v - 128.0) * 255.0 / 224.0)
+            }
+        };
+        let r = y + 2.0 * (1.0 - kr) * cr;
+        let b = y + 2.0 * (1.0 - kb) * cb;
+        let g = (y - kr * r - kb * b) / (1.0 - kr - kb);
+        [r, g, b].map(|value| value.clamp(0.0, 255.0))
+    }
+
+    #[test]
+    fn equals_a_plain_implementation() {
+        use {ColourOrder::*, YuvMatrix::*, YuvRange::*};
+        let whole = |w: u32, h: u32| BBox::new(0.0, 0.0, w.into(), h.into());
+        let wide = Placement { width: 40, height: 32, x: 4, y: 2, w: 32, h: 24 };
+        let full = Placement { width: 24, height: 16, x: 0, y: 0, w: 24, h: 16 };
+        let mut rasteriser = Rasteriser::new();
+        for (size, range, matrix, from, place, order) in [
+            ((64, 48), Limited, Bt601, whole(64, 48), wide, Bgr),
+            ((64, 48), Full, Bt709, whole(64, 48), wide, Rgb),
+            ((201, 151), Limited, Bt709, whole(201, 151), wide, Rgb),
+            ((201, 151), Limited, Bt601, BBox::new(20.5, 30.25, 100.0, 60.0), full, Bgr),
+            ((33, 17), Full, Bt601, whole(33, 17), wide, Bgr),
+            ((90, 90), Limited, Bt601, BBox::new(10.0, 12.0, 15.0, 40.0), full, Rgb),
+        ] {
+            let image = picture(size.0, size.1, range, matrix);
+            let normalisation = Normalisation::new(&InputSpec {
+                name: "images".into(),
+                shape: vec![],
+                width: place.width,
+                height: place.height,
+                multiple: 1,
+                colour: order,
+                mean: [100.0, 110.0, 120.0],
+                std: [50.0, 60.0, 70.0],
+                resize: crate::infer::Fit::Stretch,
+                pad: 114.0,
+            });
+            let mut tensor = vec![f32::NAN; 3 * place.width * place.height];
+            rasteriser.write(&image, from, place, &normalisation, &mut tensor);
+            let (mut worst, mut total) = (0f64, 0f64);
+            for y in 0..place.height {
+                for x in 0..place.width {
+                    let inside = (place.x..place.x + place.w).contains(&x)
+                        && (place.y..place.y + place.h).contains(&y);
+                    let expected = if inside {
+                        let at = (x - place.x, y - place.y);
+                        let [y, u, v] =
+                            [0, 1, 2].map(|plane| sample(&image, plane, from, (place.w, place.h), at));
+                        rgb(&image, y, u, v)
+                    } else {
+                        [114.0; 3]
+                    };
+                    for channel in 0..3 {
+                        let colour = if order == Rgb { channel } else { 2 - channel };
+                        let raw = f64::from(tensor[(channel * place.height + y) * place.width + x])
+                            * [50.0, 60.0, 70.0][channel]
+                            + [100.0, 110.0, 120.0][channel];
+                        let error = (raw - expected[colour]).abs();
+                        assert!(inside || error < 1e-3, "padding at {x},{y}: {raw}");
+                        worst = worst.max(error);
+                        total += error;
+                    }
+                }
+            }
+            // Planes are rounded to whole numbers before colour conversion, which doubles blue's error.
+            let mean = total / tensor.len() as f64;
+            assert!(worst < 4.0 && mean < 0.6, "{size:?} {range:?} {matrix:?}: worst {worst}, mean {mean}");
+        }
+    }
+}
