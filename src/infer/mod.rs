@@ -10,6 +10,7 @@ mod manifest;
 mod models;
 mod picture;
 mod runtime;
+mod scale;
 
 pub use batcher::{Arrangement, BatchModel, BatchStats, Batcher, Observer};
 pub use error::InferError;
