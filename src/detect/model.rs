@@ -142,6 +142,22 @@ impl DetectModel {
         letterbox
     }
 
+    /// A tensor that holds `batch` copies of a frame, and its shape.
+    pub(crate) fn tensor(&mut self, image: &Image, batch: usize) -> ([usize; 4], Vec<f32>) {
+        let batch = batch.min(self.most);
+        let mut shape = [batch, 3, 0, 0];
+        for at in 0..batch {
+            let place = self.prepare(image, at).place;
+            (shape[2], shape[3]) = (place.height, place.width);
+        }
+        (shape, self.tensor[..shape.iter().product()].to_vec())
+    }
+
+    /// Runs the network alone.
+    pub(crate) fn run_tensor(&mut self, shape: [usize; 4], tensor: &[f32]) -> Result<(), InferError> {
+        self.graph.run(shape, tensor, |_, _| Ok(()))
+    }
+
     /// Runs frames whose tensors have one shape.
     fn run_alike(&mut self, images: &[&Image]) -> Result<Vec<Vec<Detection>>, InferError> {
         let letterboxes: Vec<Letterbox> =

@@ -110,7 +110,7 @@ impl Embedder {
 }
 
 /// The part of a box that lies in the frame, when it is worth looking at.
-fn visible(image: &Image, bbox: &BBox) -> Option<BBox> {
+pub(crate) fn visible(image: &Image, bbox: &BBox) -> Option<BBox> {
     if !bbox.is_valid() {
         return None;
     }

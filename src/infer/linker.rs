@@ -83,7 +83,7 @@ impl Linker {
 }
 
 /// What the graph relies on: ONNX Runtime would read past a tensor or stop the process.
-fn check(request: &LinkRequest) -> Result<(), InferError> {
+pub(super) fn check(request: &LinkRequest) -> Result<(), InferError> {
     let (tracks, pairs) = (request.tracks(), request.pairs.len());
     let reason = if request.histories.len() != tracks * HISTORY * STEP_FEATURES {
         format!("{} history values for {tracks} tracks", request.histories.len())
@@ -108,7 +108,8 @@ fn warm_up() -> LinkRequest {
     }
 }
 
-struct LinkModel {
+/// One instance of the link scorer.
+pub(super) struct LinkModel {
     session: Session,
     /// The joined request of a batch.
     joined: LinkRequest,
@@ -117,7 +118,7 @@ struct LinkModel {
 }
 
 impl LinkModel {
-    fn load(runtime: &Runtime, name: &str, file: &Path) -> Result<Self, InferError> {
+    pub(super) fn load(runtime: &Runtime, name: &str, file: &Path) -> Result<Self, InferError> {
         let wrong = |reason: String| InferError::Graph { name: name.into(), reason };
         let session = runtime.session(name, file, None)?;
         for (input, element) in INPUTS {

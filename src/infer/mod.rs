@@ -2,6 +2,7 @@
 //! cameras share, the link scorer. [`Models::load`] makes all of it.
 
 mod batcher;
+pub mod bench;
 mod error;
 mod graph;
 mod linker;
@@ -9,6 +10,7 @@ mod manifest;
 mod models;
 mod picture;
 mod runtime;
+mod scale;
 
 pub use batcher::{Arrangement, BatchModel, BatchStats, Batcher, Observer};
 pub use error::InferError;

@@ -1,24 +1,17 @@
 //! Picture to tensor: a part of an I420 frame, resized and normalised, straight into planar f32.
 //!
-//! The three planes are resized as they are (a 352x288 tensor needs a tenth of the pixels of a
-//! 1080p frame), then colour conversion and normalisation are one pass over the small picture.
-
-use fast_image_resize as fir;
-use fir::images::TypedImage;
-use fir::pixels::U8;
-use fir::{FilterType, ImageView, ResizeAlg, ResizeOptions, Resizer};
+//! The three planes are brought to the output's size row by row; colour conversion and normalisation
+//! are one matrix, applied while the row is in the cache.
 
 use super::manifest::{ColourOrder, InputSpec};
+use super::scale::PlaneScaler;
 use crate::types::{BBox, Image, YuvMatrix, YuvRange};
-
-/// How far a picture may shrink by interpolating between the four nearest pixels alone. Beyond it
-/// whole pixels would be skipped, and a convolution over all of them is worth its time.
-const INTERPOLATE_UP_TO: f64 = 2.0;
 
 /// Resizes parts of frames; keeps its buffers between calls.
 pub(crate) struct Rasteriser {
-    resizer: Resizer,
-    planes: [Vec<u8>; 3],
+    planes: [PlaneScaler; 3],
+    /// One row of each plane at the output's size.
+    rows: [Vec<f32>; 3],
 }
 
 /// The normalisation of a model: raw channel values `0..=255` to `value * scale + shift`, in the
@@ -59,7 +52,7 @@ pub(crate) struct Placement {
 
 impl Rasteriser {
     pub(crate) fn new() -> Self {
-        Self { resizer: Resizer::new(), planes: [vec![], vec![], vec![]] }
+        Self { planes: Default::default(), rows: Default::default() }
     }
 
     /// Writes the part `from` of `image` (pixels, inside the picture) to its place in `tensor`, and
@@ -78,7 +71,13 @@ impl Rasteriser {
         let Placement { width, height, x, y, w, h } = place;
         assert_eq!(tensor.len(), 3 * width * height);
         assert!(x + w <= width && y + h <= height && w > 0 && h > 0);
-        self.resize(image, from, w, h);
+        for (index, plane) in self.planes.iter_mut().enumerate() {
+            let (plane_w, plane_h) = image.plane_size(index);
+            let part = if index == 0 { 1.0 } else { 0.5 };
+            plane.across.set((from.x * part, from.w * part), plane_w, w);
+            plane.down.set((from.y * part, from.h * part), plane_h, h);
+            self.rows[index].resize(w, 0.0);
+        }
         let matrix = ColourMatrix::new(image, normalisation);
         for channel in tensor.chunks_exact_mut(width * height).zip(normalisation.pad) {
             let (channel, pad) = channel;
@@ -91,74 +90,59 @@ impl Rasteriser {
                 }
             }
         }
-        let (first, rest) = tensor.split_at_mut(width * height);
-        let (second, third) = rest.split_at_mut(width * height);
+        let mut target = Target { tensor, width, area: width * height };
+        #[cfg(target_arch = "x86_64")]
+        {
+            #[target_feature(enable = "avx2")]
+            fn convert_avx2(
+                rasteriser: &mut Rasteriser,
+                image: &Image,
+                matrix: &ColourMatrix,
+                place: Placement,
+                target: &mut Target<'_>,
+            ) {
+                rasteriser.convert(image, matrix, place, target);
+            }
+            if std::arch::is_x86_feature_detected!("avx2") {
+                // SAFETY: the machine has AVX2.
+                return unsafe { convert_avx2(self, image, &matrix, place, &mut target) };
+            }
+        }
+        self.convert(image, &matrix, place, &mut target);
+    }
+
+    /// Scales, converts and normalises row by row, while a row is in the cache.
+    #[inline(always)]
+    fn convert(&mut self, image: &Image, matrix: &ColourMatrix, place: Placement, target: &mut Target<'_>) {
+        let Placement { x, y, w, h, .. } = place;
         for row in 0..h {
-            let at = (y + row) * width + x;
-            let [ys, us, vs] = self.planes.each_ref().map(|plane| &plane[row * w..(row + 1) * w]);
-            convert_row(
-                &matrix,
-                [ys, us, vs],
-                [&mut first[at..at + w], &mut second[at..at + w], &mut third[at..at + w]],
-            );
-        }
-    }
-
-    /// Brings the part `from` of every plane to `w` x `h`.
-    fn resize(&mut self, image: &Image, from: BBox, w: usize, h: usize) {
-        for index in 0..3 {
-            let (bytes, stride) = image.plane(index);
-            let (plane_w, plane_h) = image.plane_size(index);
-            let view = StridedPlane { bytes, stride, width: plane_w as u32, height: plane_h as u32 };
-            // Chroma has half the pixels; an odd last one is a whole pixel of the plane.
-            let part = if index == 0 { 1.0 } else { 0.5 };
-            let (left, top) = (from.x * part, from.y * part);
-            let crop_w = (from.w * part).min(plane_w as f64 - left);
-            let crop_h = (from.h * part).min(plane_h as f64 - top);
-            let shrink = (crop_w / w as f64).max(crop_h / h as f64);
-            let alg = if shrink <= INTERPOLATE_UP_TO {
-                ResizeAlg::Interpolation(FilterType::Bilinear)
-            } else {
-                ResizeAlg::Convolution(FilterType::Bilinear)
-            };
-            let options = ResizeOptions::new().resize_alg(alg).crop(left, top, crop_w, crop_h);
-            let plane = &mut self.planes[index];
-            plane.resize(w * h, 0);
-            let mut to = TypedImage::<U8>::from_buffer(w as u32, h as u32, plane)
-                .expect("a buffer of the size that was just set");
-            self.resizer.resize_typed(&view, &mut to, &options).expect("a part inside the plane");
+            for (index, (plane, out)) in self.planes.iter_mut().zip(&mut self.rows).enumerate() {
+                plane.row(image, index, row, out);
+            }
+            let [ys, us, vs] = &self.rows;
+            for channel in 0..3 {
+                let (ky, ku, kv) = (matrix.y[channel], matrix.u[channel], matrix.v[channel]);
+                let (bias, low, high) = (matrix.bias[channel], matrix.low[channel], matrix.high[channel]);
+                let at = channel * target.area + (y + row) * target.width + x;
+                let out = &mut target.tensor[at..at + w];
+                let (ys, us, vs) = (&ys[..w], &us[..w], &vs[..w]);
+                for i in 0..w {
+                    let value = ys[i] * ky + us[i] * ku + vs[i] * kv + bias;
+                    // As comparisons these are one instruction each; `max` and `min` mind NaN.
+                    let value = if value > low { value } else { low };
+                    out[i] = if value < high { value } else { high };
+                }
+            }
         }
     }
 }
 
-/// A plane as the decoder left it.
-struct StridedPlane<'a> {
-    bytes: &'a [u8],
-    stride: usize,
-    width: u32,
-    height: u32,
-}
-
-// SAFETY: every row is cut to exactly `width` pixels, or indexing panics.
-unsafe impl ImageView for StridedPlane<'_> {
-    type Pixel = U8;
-
-    fn width(&self) -> u32 {
-        self.width
-    }
-
-    fn height(&self) -> u32 {
-        self.height
-    }
-
-    fn iter_rows(&self, start_row: u32) -> impl Iterator<Item = &[U8]> {
-        let width = self.width as usize;
-        (start_row as usize..self.height as usize).map(move |row| {
-            let row = &self.bytes[row * self.stride..][..width];
-            // SAFETY: `U8` is a transparent wrapper of one `u8`.
-            unsafe { std::slice::from_raw_parts(row.as_ptr().cast::<U8>(), row.len()) }
-        })
-    }
+/// A `[3, height, width]` tensor.
+struct Target<'a> {
+    tensor: &'a mut [f32],
+    width: usize,
+    /// `width * height`.
+    area: usize,
 }
 
 /// YUV to the model's channels: `y * Y + u * U + v * V + bias`, held within `[low, high]`, which are
@@ -204,30 +188,150 @@ impl ColourMatrix {
     }
 }
 
-#[inline(always)]
-fn convert(matrix: &ColourMatrix, [ys, us, vs]: [&[u8]; 3], channels: [&mut [f32]; 3]) {
-    for (c, out) in channels.into_iter().enumerate() {
-        let (ky, ku, kv, bias) = (matrix.y[c], matrix.u[c], matrix.v[c], matrix.bias[c]);
-        let (low, high) = (matrix.low[c], matrix.high[c]);
-        for (((out, &y), &u), &v) in out.iter_mut().zip(ys).zip(us).zip(vs) {
-            let value = f32::from(y) * ky + f32::from(u) * ku + f32::from(v) * kv + bias;
-            *out = value.max(low).min(high);
-        }
-    }
-}
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
 
-/// One row; the same loop compiled for AVX2 where the machine has it.
-fn convert_row(matrix: &ColourMatrix, planes: [&[u8]; 3], channels: [&mut [f32]; 3]) {
-    #[cfg(target_arch = "x86_64")]
-    {
-        #[target_feature(enable = "avx2")]
-        fn convert_avx2(matrix: &ColourMatrix, planes: [&[u8]; 3], channels: [&mut [f32]; 3]) {
-            convert(matrix, planes, channels);
+    use super::*;
+    use crate::types::Plane;
+
+    /// A picture with a smooth pattern, rows longer than the picture, and the last row cut off.
+    fn picture(width: u32, height: u32, range: YuvRange, matrix: YuvMatrix) -> Image {
+        let mut bytes = vec![];
+        let planes = [
+            (width, height, 7),
+            (width.div_ceil(2), height.div_ceil(2), 5),
+            (width.div_ceil(2), height.div_ceil(2), 3),
+        ]
+        .map(|(w, h, extra)| {
+            let plane = Plane { offset: bytes.len(), stride: w as usize + extra };
+            for y in 0..h {
+                for x in 0..w {
+                    let (x, y) = (f64::from(x), f64::from(y));
+                    let wave = (x * 0.21 + extra as f64).sin() * 60.0 + (y * 0.17).cos() * 50.0;
+                    bytes.push((128.0 + wave) as u8);
+                }
+                if y + 1 < h {
+                    bytes.extend(vec![255; extra]);
+                }
+            }
+            plane
+        });
+        Image::i420((width, height), range, matrix, planes, Arc::new(bytes)).expect("a picture")
+    }
+
+    /// A plane at output pixel `(i, j)`: the mean of blocks, interpolated.
+    fn sample(
+        image: &Image,
+        index: usize,
+        from: BBox,
+        (w, h): (usize, usize),
+        (i, j): (usize, usize),
+    ) -> f64 {
+        let (bytes, stride) = image.plane(index);
+        let (plane_w, plane_h) = image.plane_size(index);
+        let part = if index == 0 { 1.0 } else { 0.5 };
+        let weights = |start: f64, length: f64, out: usize, outs: usize, size: usize| {
+            let scale = length / outs as f64;
+            let mut block = 1;
+            while (2 * block) as f64 <= scale {
+                block *= 2;
+            }
+            let blocks = size / block;
+            let centre =
+                ((start + (out as f64 + 0.5) * scale) / block as f64).clamp(0.5, blocks as f64 - 0.5);
+            (0..blocks * block)
+                .map(|x| (1.0 - ((x / block) as f64 + 0.5 - centre).abs()).max(0.0) / block as f64)
+                .collect::<Vec<f64>>()
+        };
+        let across = weights(from.x * part, from.w * part, i, w, plane_w);
+        let down = weights(from.y * part, from.h * part, j, h, plane_h);
+        let mut sum = 0.0;
+        for (y, wy) in down.iter().enumerate().filter(|(_, w)| **w > 0.0) {
+            for (x, wx) in across.iter().enumerate().filter(|(_, w)| **w > 0.0) {
+                sum += wx * wy * f64::from(bytes[y * stride + x]);
+            }
         }
-        if std::arch::is_x86_feature_detected!("avx2") {
-            // SAFETY: the machine has AVX2.
-            return unsafe { convert_avx2(matrix, planes, channels) };
+        sum
+    }
+
+    /// Red, green, blue by the textbook.
+    fn rgb(image: &Image, y: f64, u: f64, v: f64) -> [f64; 3] {
+        let (kr, kb) = if image.matrix == YuvMatrix::Bt601 { (0.299, 0.114) } else { (0.2126, 0.0722) };
+        let (y, cb, cr) = match image.range {
+            YuvRange::Full => (y, u - 128.0, v - 128.0),
+            YuvRange::Limited => {
+                ((y - 16.0) * 255.0 / 219.0, (u - 128.0) * 255.0 / 224.0, (v - 128.0) * 255.0 / 224.0)
+            }
+        };
+        let r = y + 2.0 * (1.0 - kr) * cr;
+        let b = y + 2.0 * (1.0 - kb) * cb;
+        let g = (y - kr * r - kb * b) / (1.0 - kr - kb);
+        [r, g, b].map(|value| value.clamp(0.0, 255.0))
+    }
+
+    #[test]
+    fn equals_a_plain_implementation() {
+        use {ColourOrder::*, YuvMatrix::*, YuvRange::*};
+        let whole = |w: u32, h: u32| BBox::new(0.0, 0.0, w.into(), h.into());
+        let wide = Placement { width: 40, height: 32, x: 4, y: 2, w: 32, h: 24 };
+        let full = Placement { width: 24, height: 16, x: 0, y: 0, w: 24, h: 16 };
+        let mut rasteriser = Rasteriser::new();
+        for (size, range, matrix, from, place, order) in [
+            ((64, 48), Limited, Bt601, whole(64, 48), wide, Bgr),
+            ((64, 48), Full, Bt709, whole(64, 48), wide, Rgb),
+            ((201, 151), Limited, Bt709, whole(201, 151), wide, Rgb),
+            ((201, 151), Limited, Bt601, BBox::new(20.5, 30.25, 100.0, 60.0), full, Bgr),
+            ((33, 17), Full, Bt601, whole(33, 17), wide, Bgr),
+            ((90, 90), Limited, Bt601, BBox::new(10.0, 12.0, 15.0, 40.0), full, Rgb),
+            ((90, 90), Limited, Bt601, BBox::new(80.0, 85.0, 10.0, 5.0), full, Rgb),
+            ((500, 300), Full, Bt601, whole(500, 300), wide, Rgb),
+            ((1, 1), Full, Bt601, whole(1, 1), wide, Rgb),
+            ((3, 100), Limited, Bt601, whole(3, 100), full, Rgb),
+        ] {
+            let image = picture(size.0, size.1, range, matrix);
+            let normalisation = Normalisation::new(&InputSpec {
+                name: "images".into(),
+                shape: vec![],
+                width: place.width,
+                height: place.height,
+                multiple: 1,
+                colour: order,
+                mean: [100.0, 110.0, 120.0],
+                std: [50.0, 60.0, 70.0],
+                resize: crate::infer::Fit::Stretch,
+                pad: 114.0,
+            });
+            let mut tensor = vec![f32::NAN; 3 * place.width * place.height];
+            rasteriser.write(&image, from, place, &normalisation, &mut tensor);
+            let (mut worst, mut total) = (0f64, 0f64);
+            for y in 0..place.height {
+                for x in 0..place.width {
+                    let inside = (place.x..place.x + place.w).contains(&x)
+                        && (place.y..place.y + place.h).contains(&y);
+                    let expected = if inside {
+                        let at = (x - place.x, y - place.y);
+                        let [y, u, v] =
+                            [0, 1, 2].map(|plane| sample(&image, plane, from, (place.w, place.h), at));
+                        rgb(&image, y, u, v)
+                    } else {
+                        [114.0; 3]
+                    };
+                    for channel in 0..3 {
+                        let colour = if order == Rgb { channel } else { 2 - channel };
+                        let raw = f64::from(tensor[(channel * place.height + y) * place.width + x])
+                            * [50.0, 60.0, 70.0][channel]
+                            + [100.0, 110.0, 120.0][channel];
+                        let error = (raw - expected[colour]).abs();
+                        assert!(inside || error < 1e-3, "padding at {x},{y}: {raw}");
+                        worst = worst.max(error);
+                        total += error;
+                    }
+                }
+            }
+            // Rows are joined with weights of 8 bits.
+            let mean = total / tensor.len() as f64;
+            assert!(worst < 1.0 && mean < 0.2, "{size:?} {range:?} {matrix:?}: worst {worst}, mean {mean}");
         }
     }
-    convert(matrix, planes, channels);
 }

@@ -1,0 +1,189 @@
+//! How fast the models are alone: no queue, no decoding of video, no pre-processing of frames.
+
+use std::sync::{Arc, Barrier};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use super::linker::LinkModel;
+use super::models::{Chosen, Plan, Reid};
+use super::{Arrangement, BatchModel, InferError, ModelSettings, Task};
+use crate::detect::{DetectModel, DetectSpec};
+use crate::embed::{EmbedJob, EmbedModel, NetworkModel};
+use crate::track::LinkRequest;
+use crate::types::{BBox, Image};
+
+/// What the models are asked about one frame.
+#[derive(Clone, Debug)]
+pub struct FrameWork {
+    /// The frame, for the detector and for appearance.
+    pub image: Image,
+    /// The boxes whose appearance is wanted.
+    pub boxes: Vec<BBox>,
+    /// The pairs to score.
+    pub link: LinkRequest,
+}
+
+/// What [`models_alone`] measured.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AloneReport {
+    /// Frames that were run.
+    pub frames: usize,
+    /// Threads, each with its own instance of every model.
+    pub threads: usize,
+    /// Frames that one call of the detector held.
+    pub batch: usize,
+    /// Time from the first frame to the last.
+    pub wall: Duration,
+    /// Time inside the detector, summed over the threads.
+    pub detect: Duration,
+    /// Time inside the appearance model, summed over the threads.
+    pub reid: Duration,
+    /// Time inside the link scorer, summed over the threads.
+    pub link: Duration,
+}
+
+impl AloneReport {
+    /// Frames a second of all threads together.
+    pub fn frames_per_second(&self) -> f64 {
+        self.frames as f64 / self.wall.as_secs_f64()
+    }
+}
+
+/// Tensors that are prepared beforehand; a network takes the same time whatever is in the picture, so
+/// they are used in turn.
+const PREPARED: usize = 16;
+
+/// Runs `frames` frames, taken from `work` in turn, through the detector, the appearance model and the
+/// link scorer of `settings`, one after the other on each of the threads that the provider's
+/// arrangement gives (single-threaded sessions, one a core, on the CPU).
+///
+/// # Errors
+/// What [`super::Models::load`] says, a model's failure, or no work.
+pub fn models_alone(
+    settings: &ModelSettings,
+    work: &[FrameWork],
+    frames: usize,
+) -> Result<AloneReport, InferError> {
+    if work.is_empty() || frames == 0 {
+        return Err(InferError::Setting { setting: "bench", reason: "no frames to run".into() });
+    }
+    let plan = Plan::new(settings)?;
+    let arrangement = plan.runtime.provider.arrangement(Task::Detect, settings.threads);
+    let Arrangement { workers: threads, max_batch: batch, .. } = arrangement;
+    let spec = Arc::new(DetectSpec::new(&plan.detector.entry, &settings.detection)?);
+    let barrier = Barrier::new(threads + 1);
+    let shares: Vec<usize> =
+        (0..threads).map(|t| frames / threads + usize::from(t < frames % threads)).collect();
+    thread::scope(|scope| {
+        let runs: Vec<_> = shares
+            .iter()
+            .enumerate()
+            .map(|(index, &share)| {
+                let (plan, spec, barrier) = (&plan, &spec, &barrier);
+                let run = move || {
+                    let instance = Instance::load(plan, spec, settings, arrangement, work);
+                    // Everybody arrives, or nobody would ever start.
+                    barrier.wait();
+                    instance?.run(work, share, batch)
+                };
+                thread::Builder::new()
+                    .name(format!("bench-{index}"))
+                    .spawn_scoped(scope, run)
+                    .expect("a thread for a model")
+            })
+            .collect();
+        barrier.wait();
+        let start = Instant::now();
+        let mut report = AloneReport {
+            frames,
+            threads,
+            batch,
+            wall: Duration::ZERO,
+            detect: Duration::ZERO,
+            reid: Duration::ZERO,
+            link: Duration::ZERO,
+        };
+        for run in runs {
+            let [detect, reid, link] = run.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
+            report.detect += detect;
+            report.reid += reid;
+            report.link += link;
+        }
+        report.wall = start.elapsed();
+        Ok(report)
+    })
+}
+
+/// One thread's models.
+struct Instance {
+    detector: DetectModel,
+    tensors: Vec<([usize; 4], Vec<f32>)>,
+    reid: Option<EmbedModel>,
+    link: Option<LinkModel>,
+}
+
+impl Instance {
+    fn load(
+        plan: &Plan,
+        spec: &Arc<DetectSpec>,
+        settings: &ModelSettings,
+        arrangement: Arrangement,
+        work: &[FrameWork],
+    ) -> Result<Self, InferError> {
+        let runtime = &plan.runtime;
+        let Chosen { entry, file } = &plan.detector;
+        let mut detector = DetectModel::load(runtime, entry, file, arrangement, spec.clone())?;
+        detector.warm_up()?;
+        let frames = work.iter().take(PREPARED);
+        let tensors = frames.map(|work| detector.tensor(&work.image, arrangement.max_batch)).collect();
+        let reid = match &plan.reid {
+            Reid::None => None,
+            Reid::Stripes => Some(EmbedModel::Stripes(Box::default())),
+            Reid::Network(Chosen { entry, file }) => {
+                let arrangement = runtime.provider.arrangement(Task::Reid, settings.threads);
+                let mut network = NetworkModel::load(runtime, entry, file, arrangement)?;
+                network.warm_up()?;
+                Some(EmbedModel::Network(Box::new(network)))
+            }
+        };
+        let link = match &plan.link {
+            None => None,
+            Some(Chosen { entry, file }) => Some(LinkModel::load(runtime, &entry.name, file)?),
+        };
+        Ok(Self { detector, tensors, reid, link })
+    }
+
+    /// Runs a share of the frames; the time in the detector, the appearance model and the link scorer.
+    fn run(mut self, work: &[FrameWork], share: usize, batch: usize) -> Result<[Duration; 3], InferError> {
+        let mut spent = [Duration::ZERO; 3];
+        let mut clock = Instant::now();
+        let mut lap = |spent: &mut Duration| {
+            let now = Instant::now();
+            *spent += now - clock;
+            clock = now;
+        };
+        for at in 0..share {
+            if at % batch == 0 {
+                let (shape, tensor) = &self.tensors[at / batch % self.tensors.len()];
+                self.detector.run_tensor(*shape, tensor)?;
+            }
+            lap(&mut spent[0]);
+            let FrameWork { image, boxes, link } = &work[at % work.len()];
+            if let Some(reid) = &mut self.reid
+                && !boxes.is_empty()
+            {
+                let boxes = boxes.iter().filter_map(|bbox| crate::embed::visible(image, bbox)).collect();
+                reid.run(&[EmbedJob { image: image.clone(), boxes }])?;
+            }
+            lap(&mut spent[1]);
+            if let Some(scorer) = &mut self.link
+                && !link.is_empty()
+            {
+                super::linker::check(link)?;
+                scorer.run(std::slice::from_ref(link))?;
+            }
+            lap(&mut spent[2]);
+        }
+        Ok(spent)
+    }
+}
