@@ -35,10 +35,11 @@ pub use cameras::{
     CameraError, CameraState, CameraStatus, Cameras, NewCamera, Picture, TrackCounts, Transport,
 };
 pub use server::serve;
+pub use socket::KeepAlive;
 
 use crate::publish::Hub;
 use server::Stop;
-use socket::Seats;
+use socket::{Seats, Sockets};
 use video::Studio;
 
 /// Longest body of a request.
@@ -58,6 +59,8 @@ pub struct ApiConfig {
     pub registry: Registry,
     /// What `/readyz` asks.
     pub readiness: Readiness,
+    /// How WebSockets find out that a client is gone.
+    pub keep_alive: KeepAlive,
 }
 
 /// What every handler can reach.
@@ -69,13 +72,14 @@ struct ApiState {
     readiness: Readiness,
     studio: Arc<Studio>,
     seats: Seats,
-    stop: Stop,
+    sockets: Sockets,
 }
 
 fn router(config: ApiConfig, stop: Stop) -> Router {
-    let ApiConfig { cameras, hub, registry, readiness } = config;
+    let ApiConfig { cameras, hub, registry, readiness, keep_alive } = config;
     let studio = Arc::new(Studio::default());
-    let state = ApiState { cameras, hub, registry, readiness, studio, seats: Seats::default(), stop };
+    let sockets = Sockets { keep_alive, stop };
+    let state = ApiState { cameras, hub, registry, readiness, studio, seats: Seats::default(), sockets };
     Router::new()
         .route("/v1/cameras", get(rest::list).post(rest::add))
         .route("/v1/cameras/{id}", get(rest::get).delete(rest::remove))
