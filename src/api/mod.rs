@@ -34,11 +34,10 @@ use prometheus::Registry;
 pub use cameras::{
     CameraError, CameraState, CameraStatus, Cameras, NewCamera, Picture, TrackCounts, Transport,
 };
-pub use server::serve;
+pub use server::{serve, serve_with};
 pub use socket::KeepAlive;
 
 use crate::publish::Hub;
-use server::Stop;
 use socket::{Seats, Sockets};
 use video::Studio;
 
@@ -59,8 +58,6 @@ pub struct ApiConfig {
     pub registry: Registry,
     /// What `/readyz` asks.
     pub readiness: Readiness,
-    /// How WebSockets find out that a client is gone.
-    pub keep_alive: KeepAlive,
 }
 
 /// What every handler can reach.
@@ -75,10 +72,9 @@ struct ApiState {
     sockets: Sockets,
 }
 
-fn router(config: ApiConfig, stop: Stop) -> Router {
-    let ApiConfig { cameras, hub, registry, readiness, keep_alive } = config;
+fn router(config: ApiConfig, sockets: Sockets) -> Router {
+    let ApiConfig { cameras, hub, registry, readiness } = config;
     let studio = Arc::new(Studio::default());
-    let sockets = Sockets { keep_alive, stop };
     let state = ApiState { cameras, hub, registry, readiness, studio, seats: Seats::default(), sockets };
     Router::new()
         .route("/v1/cameras", get(rest::list).post(rest::add))

@@ -173,14 +173,13 @@ impl Server {
             cameras: cameras.clone(),
             hub: hub.clone(),
             registry,
-            keep_alive,
             readiness: Arc::new(move || match answer.load(Ordering::SeqCst) {
                 true => vec![],
                 false => vec!["the detector is not loaded".to_owned()],
             }),
         };
         let (stop, stopped) = oneshot::channel();
-        let done = tokio::spawn(gakp::api::serve(listener, config, async {
+        let done = tokio::spawn(gakp::api::serve_with(listener, config, keep_alive, async {
             let _ = stopped.await;
         }));
         Self { addr, hub, cameras, ready, stop, done }
