@@ -10,6 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use cdp::{Browser, Page};
+use gakp::api::KeepAlive;
 use gakp::publish::{HubConfig, colour};
 use gakp::types::{BBox, TrackId};
 use serde_json::json;
@@ -165,7 +166,7 @@ async fn the_page_comes_back_with_the_service() {
     server.stop().await;
     browser.wait_for(&page, "the warning", "!document.querySelector('#offline').hidden").await;
     let before = browser.eval(&page, &format!("Number({gate}.dataset.seq)")).await.as_u64().unwrap();
-    let server = Server::start_on(addr, cameras, HubConfig::default()).await;
+    let server = Server::start_on(addr, cameras, HubConfig::default(), KeepAlive::default()).await;
     let later = format!("{gate}.dataset.seq > {} && document.querySelector('#offline').hidden", before + 5);
     browser.wait_for(&page, "pictures again", &later).await;
     filming.abort();

@@ -69,7 +69,7 @@ pub(super) async fn mjpeg(
         .watch(&*state.cameras, &camera_id(&name)?, view)
         .ok_or_else(|| Problem::unknown_camera(&name))?;
     let seat = state.seats.take()?;
-    let stop = state.stop.clone();
+    let stop = state.sockets.stop.clone();
     // One part at most waits for the connection, so what is sent is new.
     let (parts, body) = mpsc::channel::<Bytes>(1);
     tokio::spawn(async move {
@@ -139,11 +139,11 @@ pub(super) async fn live(
         .watch(&*state.cameras, &id, View::Plain)
         .ok_or_else(|| Problem::unknown_camera(&name))?;
     let seat = state.seats.take()?;
-    let stop = state.stop.clone();
+    let sockets = state.sockets.clone();
     let stream = PictureStream { shots, classes: state.hub.classes().clone() };
     Ok(upgrade.on_upgrade(|socket| async move {
         let _seat = seat;
-        socket::run(socket, stop, stream).await;
+        socket::run(socket, sockets, stream).await;
     }))
 }
 

@@ -34,11 +34,11 @@ use prometheus::Registry;
 pub use cameras::{
     CameraError, CameraState, CameraStatus, Cameras, NewCamera, Picture, TrackCounts, Transport,
 };
-pub use server::serve;
+pub use server::{serve, serve_with};
+pub use socket::KeepAlive;
 
 use crate::publish::Hub;
-use server::Stop;
-use socket::Seats;
+use socket::{Seats, Sockets};
 use video::Studio;
 
 /// Longest body of a request.
@@ -69,13 +69,13 @@ struct ApiState {
     readiness: Readiness,
     studio: Arc<Studio>,
     seats: Seats,
-    stop: Stop,
+    sockets: Sockets,
 }
 
-fn router(config: ApiConfig, stop: Stop) -> Router {
+fn router(config: ApiConfig, sockets: Sockets) -> Router {
     let ApiConfig { cameras, hub, registry, readiness } = config;
     let studio = Arc::new(Studio::default());
-    let state = ApiState { cameras, hub, registry, readiness, studio, seats: Seats::default(), stop };
+    let state = ApiState { cameras, hub, registry, readiness, studio, seats: Seats::default(), sockets };
     Router::new()
         .route("/v1/cameras", get(rest::list).post(rest::add))
         .route("/v1/cameras/{id}", get(rest::get).delete(rest::remove))

@@ -107,7 +107,7 @@ pub(super) async fn healthz() -> Response {
 /// Whether the service does its job now, and if not, why.
 pub(super) async fn readyz(State(state): State<ApiState>) -> Response {
     let mut reasons = (state.readiness)();
-    if state.stop.is_stopping() {
+    if state.sockets.stop.is_stopping() {
         reasons.push("the service is shutting down".to_owned());
     }
     if reasons.is_empty() {

@@ -13,6 +13,7 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
+use super::socket::{KeepAlive, Sockets};
 use super::{ApiConfig, router};
 
 /// Plain HTTP connections at a time, WebSockets not among them. More wait in the kernel's backlog.
@@ -51,9 +52,22 @@ pub async fn serve(
     config: ApiConfig,
     shutdown: impl Future<Output = ()> + Send,
 ) -> io::Result<()> {
+    serve_with(listener, config, KeepAlive::default(), shutdown).await
+}
+
+/// [`serve`] with another idea of when a WebSocket's client is gone.
+///
+/// # Errors
+/// As [`serve`].
+pub async fn serve_with(
+    listener: TcpListener,
+    config: ApiConfig,
+    keep_alive: KeepAlive,
+    shutdown: impl Future<Output = ()> + Send,
+) -> io::Result<()> {
     listener.local_addr()?;
     let (stop, stopped) = watch::channel(false);
-    let router = router(config, Stop(stopped.clone()));
+    let router = router(config, Sockets { keep_alive, stop: Stop(stopped.clone()) });
     let mut connections = JoinSet::new();
     let mut shutdown = std::pin::pin!(shutdown);
     loop {

@@ -16,16 +16,34 @@ use super::server::Stop;
 
 /// Long-lived streams at a time (WebSockets and MJPEG).
 const MAX_STREAMS: usize = 256;
-/// How often a quiet peer is asked whether it is there.
-const PING_EVERY: Duration = Duration::from_secs(10);
-/// A peer that has said nothing for so long, not even pong, is gone.
-const DEAD_AFTER: Duration = Duration::from_secs(30);
 /// A peer that takes no byte for so long is gone.
 pub(super) const SEND_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long a closing peer has to answer.
 const CLOSE_TIMEOUT: Duration = Duration::from_millis(500);
 /// Longest message taken from a client: none is expected, pongs have at most 125 bytes.
 const MAX_INCOMING: usize = 4096;
+
+/// How a WebSocket finds out that its client is gone.
+#[derive(Clone, Copy, Debug)]
+pub struct KeepAlive {
+    /// How often a client is asked whether it is there.
+    pub ping_every: Duration,
+    /// A client that has said nothing for so long, not even pong, is gone.
+    pub dead_after: Duration,
+}
+
+impl Default for KeepAlive {
+    fn default() -> Self {
+        Self { ping_every: Duration::from_secs(10), dead_after: Duration::from_secs(30) }
+    }
+}
+
+/// What every WebSocket of this service goes by.
+#[derive(Clone)]
+pub(super) struct Sockets {
+    pub keep_alive: KeepAlive,
+    pub stop: Stop,
+}
 
 /// Bounds the streams that are open at a time.
 #[derive(Clone)]
@@ -87,9 +105,10 @@ pub(super) trait Outgoing: Send {
 }
 
 /// Sends what `outgoing` has until it ends, the peer goes, or the service stops.
-pub(super) async fn run(socket: WebSocket, mut stop: Stop, mut outgoing: impl Outgoing) {
+pub(super) async fn run(socket: WebSocket, sockets: Sockets, mut outgoing: impl Outgoing) {
+    let Sockets { keep_alive, mut stop } = sockets;
     let (mut sender, mut receiver) = socket.split();
-    let mut ping = interval(PING_EVERY);
+    let mut ping = interval(keep_alive.ping_every);
     ping.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut heard = Instant::now();
     let (code, reason) = loop {
@@ -105,7 +124,7 @@ pub(super) async fn run(socket: WebSocket, mut stop: Stop, mut outgoing: impl Ou
                 }
             },
             _ = ping.tick() => {
-                if heard.elapsed() > DEAD_AFTER {
+                if heard.elapsed() > keep_alive.dead_after {
                     return;
                 }
                 Message::Ping(Default::default())

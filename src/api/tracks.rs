@@ -33,12 +33,12 @@ pub(super) async fn tracks(
         Some(protocol) if protocol == PROTOBUF => Format::Protobuf,
         _ => Format::Json,
     };
-    let stop = state.stop.clone();
+    let sockets = state.sockets.clone();
     // Subscribed before the answer goes out: nothing published after the handshake is missed.
     let stream = TrackStream { subscription: state.hub.subscribe(only), format };
     Ok(upgrade.on_upgrade(|socket| async move {
         let _seat = seat;
-        socket::run(socket, stop, stream).await;
+        socket::run(socket, sockets, stream).await;
     }))
 }
 

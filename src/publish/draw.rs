@@ -84,10 +84,11 @@ pub fn annotate(canvas: &mut Rgb, tracks: &FrameTracks, trails: &Trails) {
     }
 }
 
-/// A track's colour: hues a golden angle apart, so that neighbours in time look different.
+/// A track's colour: hues a golden angle apart, so that neighbours in time look different, and light
+/// enough for a black id on any of them.
 pub fn colour(id: TrackId) -> [u8; 3] {
     let hue = (id.0 % 1_000_000) as f64 * 137.508 % 360.0;
-    hsl(hue, 0.9, 0.6)
+    hsl(hue, 0.9, 0.7)
 }
 
 /// CSS's `hsl(hue, saturation, lightness)`.

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use futures::future::BoxFuture;
 use futures::{FutureExt, StreamExt};
 use gakp::api::{
-    ApiConfig, CameraError, CameraState, CameraStatus, Cameras, NewCamera, Picture, TrackCounts,
+    ApiConfig, CameraError, CameraState, CameraStatus, Cameras, KeepAlive, NewCamera, Picture, TrackCounts,
 };
 use gakp::publish::{Hub, HubConfig};
 use gakp::types::{
@@ -27,7 +27,7 @@ use tokio_tungstenite::tungstenite::{Error as WsError, Message};
 use tokio_tungstenite::{WebSocketStream, client_async};
 
 /// Long enough for any step on a busy machine; reaching it is a failure.
-pub const PATIENCE: Duration = Duration::from_secs(20);
+pub const PATIENCE: Duration = Duration::from_secs(60);
 /// How many cameras the made-up service allows.
 pub const LIMIT: usize = 4;
 
@@ -149,10 +149,19 @@ pub struct Server {
 
 impl Server {
     pub async fn start() -> Self {
-        Self::start_on("127.0.0.1:0".parse().unwrap(), Arc::default(), HubConfig::default()).await
+        Self::start_with(HubConfig::default(), KeepAlive::default()).await
     }
 
-    pub async fn start_on(addr: SocketAddr, cameras: Arc<FakeCameras>, hub: HubConfig) -> Self {
+    pub async fn start_with(hub: HubConfig, keep_alive: KeepAlive) -> Self {
+        Self::start_on("127.0.0.1:0".parse().unwrap(), Arc::default(), hub, keep_alive).await
+    }
+
+    pub async fn start_on(
+        addr: SocketAddr,
+        cameras: Arc<FakeCameras>,
+        hub: HubConfig,
+        keep_alive: KeepAlive,
+    ) -> Self {
         let listener = TcpListener::bind(addr).await.unwrap();
         let addr = listener.local_addr().unwrap();
         let hub = Hub::new(hub, ["person".to_owned(), "car".to_owned()].into());
@@ -170,7 +179,7 @@ impl Server {
             }),
         };
         let (stop, stopped) = oneshot::channel();
-        let done = tokio::spawn(gakp::api::serve(listener, config, async {
+        let done = tokio::spawn(gakp::api::serve_with(listener, config, keep_alive, async {
             let _ = stopped.await;
         }));
         Self { addr, hub, cameras, ready, stop, done }

@@ -1,8 +1,10 @@
 //! `/v1/tracks`: JSON, protobuf, filters, slow clients, foreign origins.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use futures::SinkExt;
+use gakp::api::KeepAlive;
 use gakp::publish::HubConfig;
 use gakp::publish::wire::{self, track_message::Message as Payload};
 use gakp::types::{BBox, FrameTracks, TrackReport};
@@ -117,7 +119,7 @@ async fn who_may_not_or_cannot_is_told_why() {
 async fn a_slow_client_is_told_what_it_missed() {
     const REPORTS: u64 = 3000;
     let hub = HubConfig { capacity: 8, ..HubConfig::default() };
-    let server = Server::start_on("127.0.0.1:0".parse().unwrap(), Arc::default(), hub).await;
+    let server = Server::start_with(hub, KeepAlive::default()).await;
     server.cameras.put("gate", "rtsp://host/gate");
     let mut slow = server.narrow_socket("/v1/tracks").await;
     let mut quick = server.socket("/v1/tracks", &[]).await.ok().unwrap();
@@ -148,6 +150,24 @@ async fn a_slow_client_is_told_what_it_missed() {
     }
     assert!(missed > 0, "the test was too gentle");
     assert_eq!(server.hub.metrics().dropped_by_lag.get(), missed);
+    server.stop().await;
+}
+
+/// A client that does not even answer a ping is gone, though its connection stands; one that reads,
+/// and so answers, stays.
+#[tokio::test]
+async fn a_client_that_says_nothing_is_dropped() {
+    let keep_alive = KeepAlive { ping_every: Duration::from_millis(50), dead_after: Duration::from_secs(3) };
+    let server = Server::start_with(HubConfig::default(), keep_alive).await;
+    server.cameras.put("gate", "rtsp://host/gate");
+    let mut alive = server.socket("/v1/tracks", &[]).await.ok().unwrap();
+    let _mute = server.socket("/v1/tracks", &[]).await.ok().unwrap();
+    let subscribers = server.hub.metrics().subscribers.clone();
+    assert_eq!(subscribers.get(), 2);
+    let listening = tokio::spawn(async move { alive.json().await });
+    eventually("the mute client to be dropped", || subscribers.get() == 1).await;
+    server.hub.publish(report("gate", 0));
+    assert_eq!(listening.await.unwrap()["seq"], 0, "the other one is still there");
     server.stop().await;
 }
 

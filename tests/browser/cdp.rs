@@ -15,7 +15,7 @@ use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::{WebSocketStream, client_async_with_config};
 
 const CHROMIUM: &str = "/usr/bin/chromium";
-const PATIENCE: Duration = Duration::from_secs(30);
+const PATIENCE: Duration = Duration::from_secs(60);
 
 /// A running browser with a fresh profile; it ends when dropped.
 pub struct Browser {
@@ -95,7 +95,7 @@ impl Browser {
         answer["result"].get("value").cloned().unwrap_or(Value::Null)
     }
 
-    /// Evaluates until it is truthy (at most half a minute); the value.
+    /// Evaluates until it is truthy (at most a minute); the value.
     pub async fn wait_for(&mut self, page: &Page, what: &str, expression: &str) -> Value {
         let expression = format!("(() => {{ try {{ return {expression}; }} catch {{ return null; }} }})()");
         for _ in 0..PATIENCE.as_millis() / 50 {

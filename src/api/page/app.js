@@ -108,7 +108,7 @@ function show(cameras) {
     showCamera(card, camera);
   });
   const live = cameras.filter((c) => c.state === "live").length;
-  $("#summary").textContent = `${cameras.length} cameras, ${live} live`;
+  $("#summary").textContent = `${cameras.length} ${cameras.length === 1 ? "camera" : "cameras"}, ${live} live`;
   $("#none").hidden = cameras.length > 0;
 }
 

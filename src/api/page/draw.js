@@ -3,7 +3,7 @@
 const TRAIL_MS = 2000;
 
 /** A track's colour: hues a golden angle apart. */
-export const colour = (id) => `hsl(${((id % 1e6) * 137.508) % 360} 90% 60%)`;
+export const colour = (id) => `hsl(${((id % 1e6) * 137.508) % 360} 90% 70%)`;
 
 /** Where the tracks of one camera stood in the last seconds. */
 export class Trails {
