@@ -66,10 +66,8 @@ impl Clear {
             }
             let score = |(row, col): (usize, usize), iou: f64| {
                 let goes_on = previous[frame.truth[row]] == Some(frame.tracks[col]);
-                match iou < MATCH_IOU {
-                    true => 0.0,
-                    false => f64::from(u8::from(goes_on)) * 1000.0 + iou,
-                }
+                let bonus = if goes_on { 1000.0 } else { 0.0 };
+                if iou < MATCH_IOU { 0.0 } else { bonus + iou }
             };
             let mut pairs = best_pairs(&frame.similarity.map(score));
             pairs.retain(|&at| frame.similarity[at] >= MATCH_IOU);
@@ -90,11 +88,12 @@ impl Clear {
         }
         for (matched, count) in matched.into_iter().zip(&scene.truth_counts) {
             let part = ratio(matched, *count);
-            match part {
-                _ if part > 0.8 => out.mt += 1,
-                _ if part >= 0.2 => out.pt += 1,
-                _ => out.ml += 1,
-            }
+            let bucket = match part {
+                _ if part > 0.8 => &mut out.mt,
+                _ if part >= 0.2 => &mut out.pt,
+                _ => &mut out.ml,
+            };
+            *bucket += 1;
         }
         out.frag = pieces.iter().map(|n| n.saturating_sub(1)).sum();
         out

@@ -119,12 +119,12 @@ impl Hota {
                 out.ass_pr[a] += n as f64 * ratio(n, track);
             }
         }
-        for a in 0..ALPHAS {
+        for (a, sum) in similarity_sum.into_iter().enumerate() {
             let n = out.tp[a].max(1) as f64;
             out.ass_a[a] /= n;
             out.ass_re[a] /= n;
             out.ass_pr[a] /= n;
-            out.loc_a[a] = mean_iou(similarity_sum[a], out.tp[a]);
+            out.loc_a[a] = mean_iou(sum, out.tp[a]);
         }
         out
     }

@@ -22,7 +22,7 @@ def people(rng, grid, classes):
     out = []
     for identity in range(1, rng.randint(5, 10)):
         kind = rng.choices([1, 2, 3, 6, 7, 8, 9, 12], [14, 1, 1, 1, 2, 1, 1, 1])[0]
-        x, y, w, h = rng.randrange(0, 160, grid), rng.randrange(0, 60, grid), 20, 40
+        x, y, w, h = rng.randrange(0, 160, grid), rng.randrange(0, 60, grid), 24, 40
         dx, dy = rng.choice([-4, -2, 0, 2, 4]), rng.choice([-1, 0, 0, 1])
         first, last = rng.randint(1, 8), rng.randint(18, LENGTH)
         gone = range(*sorted(rng.sample(range(first, last), 2))) if rng.random() < 0.3 else ()
@@ -49,14 +49,14 @@ def track(rng, truth, grid):
             if identity not in names or rng.random() < 0.05:  # born, or split
                 names[identity], following = following, following + 1
             x, y, w, h = boxes[t]
-            shift = rng.choice([0] * 6 + [2, 4, 20 / 3, 10, -2])  # 20 / 3: an IoU of one half
+            shift = rng.choice([0] * 6 + [2, 4, 8, 10, -2])  # 8 of 24: an IoU of exactly one half
             if rng.random() < 0.3:
                 shift, w, h = shift + rng.uniform(-1, 1), w + rng.uniform(-2, 2), h + rng.uniform(-4, 4)
             if names[identity] not in taken:
                 taken.add(names[identity])
                 rows.append((t, names[identity], x + shift, y, w, h))
         if rng.random() < 0.2:
-            rows.append((t, following, rng.randrange(0, 200, grid), rng.randrange(0, 80, grid), 20, 40))
+            rows.append((t, following, rng.randrange(0, 200, grid), rng.randrange(0, 80, grid), 24, 40))
             following += 1
     return rows
 
