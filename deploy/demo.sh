@@ -65,7 +65,7 @@ wait_for() {
         running camera "$CAMERA"
         running service "$SERVICE"
         if [ $SECONDS -ge $deadline ]; then
-            tail -n 20 "$LOGS"/* >&2
+            tail -n 20 "$LOGS/camera" "$LOGS/service" >&2
             fail "$what within $START_SECONDS s: no"
         fi
         sleep 0.2
@@ -105,8 +105,9 @@ trap 'exit 143' TERM
 # In sessions of their own: Ctrl-C reaches this script alone, which then ends them in order.
 setsid "$GAKP" camera models/cache/vtest.avi --listen "127.0.0.1:$RTSP_PORT" >"$LOGS/camera" 2>&1 </dev/null &
 CAMERA=$!
+# Cameras that are added to the demo are not remembered.
 setsid "$GAKP" serve --listen "127.0.0.1:$PORT" --camera "demo=rtsp://127.0.0.1:$RTSP_PORT/live" \
-    >"$LOGS/service" 2>&1 </dev/null &
+    --state-dir "$LOGS/state" >"$LOGS/service" 2>&1 </dev/null &
 SERVICE=$!
 wait_for "the test camera listens" camera_listens
 wait_for "the service is ready" service_ready

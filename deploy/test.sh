@@ -23,7 +23,13 @@ run cargo test --locked --features learn
 # would build just the same.
 run cargo test --locked --no-default-features
 if cargo deny --version >/dev/null 2>&1; then
-    run cargo deny --all-features check
+    run cargo deny --all-features check bans licenses sources
+    # The advisories are a repository of their own, which not every machine reaches.
+    if cargo deny --log-level off fetch db; then
+        run cargo deny --all-features check advisories
+    else
+        echo "SKIPPED: advisories about dependencies; their database cannot be fetched from here"
+    fi
 else
     echo "SKIPPED: the dependency policy (deny.toml); 'cargo install --locked cargo-deny' adds the tool"
 fi
