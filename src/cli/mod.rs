@@ -69,7 +69,8 @@ pub fn run(cli: Cli) -> anyhow::Result<()> {
 
 /// Logs go to standard error; what a command prints goes to standard output.
 fn start_log(level: &str, json: bool) -> anyhow::Result<()> {
-    let filter = tracing_subscriber::EnvFilter::try_new(level)
+    // ONNX Runtime tells every step of its optimiser; say `ort=info` to hear it.
+    let filter = tracing_subscriber::EnvFilter::try_new(format!("ort=warn,{level}"))
         .map_err(|e| anyhow::anyhow!("--log {level:?}: {e}; use error, warn, info, debug or trace"))?;
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr);
     let started = match json {

@@ -270,8 +270,6 @@ impl Sink {
         let id = &self.view.id;
         match event {
             SourceEvent::Opened(opened) => {
-                tracing::info!(camera = %id, width = opened.width, height = opened.height,
-                    codec = opened.codec, decoder = opened.decoder, "camera is live");
                 if std::mem::replace(&mut self.opened_before, true) {
                     self.view.metrics.reconnects.inc();
                 }
