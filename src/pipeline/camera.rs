@@ -293,12 +293,6 @@ impl Sink {
             }
             SourceEvent::Lost { reason, retry_in } => {
                 self.all.camera_failed(id, reason.label());
-                match retry_in {
-                    Some(wait) => {
-                        tracing::warn!(camera = %id, reason = %reason, retry_in_s = wait.as_secs_f32(), "camera lost");
-                    }
-                    None => tracing::error!(camera = %id, reason = %reason, "camera failed for good"),
-                }
                 self.view.change(|c| {
                     c.state = if retry_in.is_some() { CameraState::Retrying } else { CameraState::Failed };
                     c.last_failure = Some(reason);
@@ -310,7 +304,6 @@ impl Sink {
                 }
             }
             SourceEvent::Ended => {
-                tracing::info!(camera = %id, frames = self.index, "source has ended");
                 self.view.change(|c| {
                     c.state = CameraState::Ended;
                     c.fps = None;
