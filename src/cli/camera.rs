@@ -10,7 +10,8 @@ use crate::ingest::Transport;
 use crate::ingest::testcam::{Codec, TestCamera, TestCameraConfig};
 
 /// Serve a video over RTSP, looping, as if it were a camera.
-#[derive(Debug, clap::Args)]
+// No `Debug`: it holds a password.
+#[derive(clap::Args)]
 pub struct Args {
     /// The video: H.264 and H.265 are sent as they are, anything else is transcoded first.
     file: PathBuf,
@@ -50,6 +51,7 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         (Some(_), Some(_)) => bail!("a user name cannot contain a colon"),
         _ => None,
     };
+    eprintln!("reading {}", args.file.display());
     let camera = TestCamera::start(TestCameraConfig {
         file: args.file,
         listen: args.listen,

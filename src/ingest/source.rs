@@ -151,7 +151,8 @@ pub fn start(
         // Either outcome ends the thread.
         let _ = source.run();
         let _ = finished.try_send(());
-    })?;
+    });
+    let thread = thread.map_err(SourceError::Thread)?;
     Ok(SourceHandle { name: name.clone(), stop, done, thread: Some(thread) })
 }
 

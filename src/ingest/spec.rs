@@ -76,7 +76,7 @@ impl SourceSpec {
     /// Says what is wrong before anything is opened: a missing file, settings out of range.
     pub fn check(&self) -> Result<(), SourceError> {
         if let Location::File(path) = self.url.location() {
-            let file = |source| SourceError::File { path: path.display().to_string(), source };
+            let file = |cause| SourceError::File { path: path.display().to_string(), cause };
             let meta = std::fs::metadata(path).map_err(file)?;
             if meta.is_dir() {
                 return Err(file(std::io::Error::other("it is a directory, not a video")));
@@ -120,12 +120,12 @@ pub enum SourceError {
         known: &'static str,
     },
     /// A file that cannot be read.
-    #[error("cannot open video {path:?}: {source}")]
+    #[error("cannot open video {path:?}: {cause}")]
     File {
         /// Which.
         path: String,
         /// Why.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// A setting out of range.
     #[error("bad source setting: {0}")]
@@ -135,5 +135,5 @@ pub enum SourceError {
     Gstreamer(String),
     /// The system gave no thread.
     #[error("cannot start a camera thread: {0}")]
-    Thread(#[from] std::io::Error),
+    Thread(std::io::Error),
 }

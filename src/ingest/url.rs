@@ -301,6 +301,8 @@ mod tests {
             let url = SourceUrl::parse(text).unwrap();
             assert_eq!(url.redacted(), shown);
             assert!(!format!("{url} {url:?}").contains("hunter2"), "{text}");
+            let spec = crate::ingest::SourceSpec::parse(text).unwrap();
+            assert!(!format!("{spec:?}").contains("hunter2"), "{text}");
             assert_eq!(url.with_secrets(), text);
             let scrubbed = url.scrub(&format!("cannot open {text}"));
             assert!(!scrubbed.contains("hunter2"), "{scrubbed}");

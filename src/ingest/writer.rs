@@ -28,12 +28,12 @@ pub enum WriterError {
     #[error("cannot write video: GStreamer has no {0}")]
     Missing(String),
     /// The file cannot be created.
-    #[error("cannot write video {path:?}: {source}")]
+    #[error("cannot write video {path:?}: {cause}")]
     File {
         /// Which.
         path: String,
         /// Why.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// A frame of the wrong size or kind.
     #[error("cannot write this frame: {0}")]
@@ -71,7 +71,7 @@ impl VideoWriter {
     ) -> Result<Self, WriterError> {
         init().map_err(|e| WriterError::Missing(e.to_string()))?;
         let shown = path.display().to_string();
-        let file = |source| WriterError::File { path: shown.clone(), source };
+        let file = |cause| WriterError::File { path: shown.clone(), cause };
         // GStreamer would report it only with the first frame.
         std::fs::File::create(path).map_err(file)?;
         if width < 2 || height < 2 {

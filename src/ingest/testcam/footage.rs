@@ -36,7 +36,7 @@ pub(super) struct Unit {
 pub(super) fn load(path: &Path, codec: Option<Codec>, fps: Option<f64>) -> Result<Footage, TestCameraError> {
     let shown = path.display().to_string();
     let failed = |what: String| TestCameraError::Video { path: shown.clone(), what };
-    std::fs::File::open(path).map_err(|source| TestCameraError::File { path: shown.clone(), source })?;
+    std::fs::File::open(path).map_err(|cause| TestCameraError::File { path: shown.clone(), cause })?;
 
     let pipeline = gst::Pipeline::new();
     let source = make("filesrc")?;

@@ -82,12 +82,12 @@ impl TestCameraConfig {
 #[derive(Debug, thiserror::Error)]
 pub enum TestCameraError {
     /// The file cannot be opened.
-    #[error("cannot open video {path:?}: {source}")]
+    #[error("cannot open video {path:?}: {cause}")]
     File {
         /// Which.
         path: String,
         /// Why.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// The file cannot be used.
     #[error("cannot serve {path:?}: {what}")]
@@ -101,12 +101,12 @@ pub enum TestCameraError {
     #[error("cannot serve video: {0}")]
     Missing(String),
     /// The address cannot be listened on.
-    #[error("cannot listen on {address}: {source}")]
+    #[error("cannot listen on {address}: {cause}")]
     Listen {
         /// Where.
         address: SocketAddr,
         /// Why.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// A setting out of range.
     #[error("bad test camera setting: {0}")]
@@ -141,7 +141,7 @@ impl TestCamera {
             return Err(TestCameraError::Setting("fps must be 0.1 to 240".into()));
         }
         // GStreamer does not say why it cannot listen; asked before the work of reading the file.
-        let taken = |source| TestCameraError::Listen { address: config.listen, source };
+        let taken = |cause| TestCameraError::Listen { address: config.listen, cause };
         TcpListener::bind(config.listen).map_err(taken)?;
         let footage = Arc::new(footage::load(&config.file, config.codec, config.fps)?);
         let (frames, codec) = (footage.units.len(), footage.codec);
