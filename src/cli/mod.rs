@@ -15,7 +15,7 @@ pub mod train;
 use std::io::{self, IsTerminal};
 
 /// Point it at RTSP cameras, subscribe to tracks.
-#[derive(Debug, clap::Parser)]
+#[derive(clap::Parser)]
 #[command(name = "gakp", version)]
 pub struct Cli {
     /// What to do.
@@ -30,7 +30,7 @@ pub struct Cli {
 }
 
 /// Subcommands.
-#[derive(Debug, clap::Subcommand)]
+#[derive(clap::Subcommand)]
 pub enum Command {
     /// Run the service: cameras in, tracks out.
     #[cfg(feature = "service")]
@@ -69,6 +69,12 @@ pub fn run(cli: Cli) -> anyhow::Result<()> {
 
 /// Logs go to standard error; what a command prints goes to standard output.
 fn start_log(level: &str, json: bool) -> anyhow::Result<()> {
+    // A word that is no level would be taken as a module's name, and all else would fall silent.
+    let levels = level.split(',').filter(|part| !part.contains(['=', '[']));
+    for word in levels.map(str::trim) {
+        let known = word.parse::<tracing_subscriber::filter::LevelFilter>().is_ok();
+        anyhow::ensure!(known, "--log {level:?}: {word:?} is none of off, error, warn, info, debug, trace");
+    }
     // ONNX Runtime tells every step of its optimiser; say `ort=info` to hear it.
     let filter = tracing_subscriber::EnvFilter::try_new(format!("ort=warn,{level}"))
         .map_err(|e| anyhow::anyhow!("--log {level:?}: {e}; use error, warn, info, debug or trace"))?;
