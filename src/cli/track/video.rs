@@ -28,9 +28,8 @@ pub fn track(input: &str, job: &Job, out: &mut Output) -> Result<()> {
     let models = Models::load(&job.models, metrics.clone())?;
     let runtime =
         tokio::runtime::Builder::new_multi_thread().thread_name("async").worker_threads(1).enable_all().build()?;
-    let tracked = runtime.block_on(run(spec, models, metrics, job, out));
-    out.finish()?;
-    tracked
+    runtime.block_on(run(spec, models, metrics, job, out))?;
+    out.finish()
 }
 
 async fn run(
@@ -58,10 +57,12 @@ async fn run(
     let mut film = job.video.as_deref().map(Film::new);
     let (mut frames, start) = (0u64, Instant::now());
     let mut failure = None;
+    // One listener for the whole run: a signal that comes while a picture is drawn counts as well.
+    let mut interrupt = std::pin::pin!(tokio::signal::ctrl_c());
     loop {
         let picture = tokio::select! {
+            _ = &mut interrupt => None,
             picture = tracked.recv() => picture,
-            _ = tokio::signal::ctrl_c() => None,
         };
         let Some(picture) = picture else { break };
         let condition = camera.view().condition();
