@@ -19,8 +19,16 @@ use crate::types::{CameraId, Epoch};
 /// Tracked frames that may wait to be written.
 const UNWRITTEN: usize = 4;
 
+/// How much was tracked, and how long it took from opening the source to the last frame.
+pub struct Tracked {
+    /// Frames.
+    pub frames: u64,
+    /// Seconds; loading models is not in it.
+    pub seconds: f64,
+}
+
 /// Tracks `input` to its end, to `job.frames`, or until Ctrl-C.
-pub fn track(input: &str, job: &Job, out: &mut Output) -> Result<()> {
+pub fn track(input: &str, job: &Job, out: &mut Output) -> Result<Tracked> {
     let mut spec = SourceSpec::parse(input)?;
     spec.pacing = Pacing::AsFastAsPossible;
     spec.check()?;
@@ -39,7 +47,7 @@ async fn run(
     metrics: std::sync::Arc<Metrics>,
     job: &Job,
     out: &mut Output,
-) -> Result<()> {
+) -> Result<Tracked> {
     let lanes = Lanes::start(models, metrics)?;
     let name = spec.url.redacted().to_string();
     let live = spec.retries();
@@ -102,7 +110,7 @@ async fn run(
         bail!("{name}: {reason}");
     }
     tracing::info!(frames, seconds, frames_per_second = frames as f64 / seconds, "tracked");
-    Ok(())
+    Ok(Tracked { frames, seconds })
 }
 
 /// The annotated copy.
