@@ -8,6 +8,9 @@
 //! [`types`], [`track`] and [`mot`] are pure: they know no clock, thread, file or model, and
 //! `cargo test --no-default-features` builds and tests them alone.
 
+// F, Q, H, R, P, S and K are the field's names.
+#![allow(non_snake_case)]
+
 pub mod types;
 
 #[cfg(feature = "ingest")]

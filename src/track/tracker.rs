@@ -1,0 +1,433 @@
+//! The tracker of one camera: predict, then update, once a frame.
+
+use super::association::{Match, match_pairs};
+use super::config::{PairScore, TrackerConfig};
+use super::features;
+use super::gate::{PairGeometry, gate};
+use super::link::{LinkRequest, Pair};
+use super::shift::global_shift;
+use super::tracklet::Tracklet;
+use crate::types::{BBox, Detection, Embedding, MediaTime, TrackId, TrackReport};
+
+/// One frame as the tracker sees it.
+#[derive(Clone, Copy, Debug)]
+pub struct FrameInput<'a> {
+    /// When, on the camera's own time line.
+    pub time: MediaTime,
+    /// Width of the picture, pixels.
+    pub width: f64,
+    /// Height of the picture, pixels.
+    pub height: f64,
+    /// What was detected, in any order. Boxes that are not finite or have no area are ignored.
+    pub detections: &'a [Detection],
+    /// The detections' embeddings: empty, or one entry a detection.
+    pub embeddings: &'a [Option<Embedding>],
+}
+
+/// What the tracker says about the frame that it was just given.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Update {
+    /// Live tracks, in the order of their ids.
+    pub tracks: Vec<TrackReport>,
+    /// Tracks that died, in the order of their ids.
+    pub ended: Vec<TrackId>,
+}
+
+/// What to do with a frame: [`Tracker::decide`] makes it from scores, training from the truth.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Decision {
+    /// Matches; a track and a detection at most once each.
+    pub matches: Vec<Match>,
+    /// Detections that become tracks, in the order of the ids that they get.
+    pub births: Vec<usize>,
+}
+
+/// Misuse of the predict-update contract.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum TrackError {
+    /// `update` without `predict`.
+    #[error("update without a frame: call predict first")]
+    NoFrame,
+    /// The scorer's answer does not fit the request.
+    #[error("{got} link probabilities for {expected} pairs: the scorer must answer every pair")]
+    ScoreCount {
+        /// Pairs asked for.
+        expected: usize,
+        /// Probabilities given.
+        got: usize,
+    },
+}
+
+/// A gated pair of the frame in hand.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GatedPair {
+    /// Index into [`Tracker::tracks`].
+    pub track: usize,
+    /// Index into [`Tracker::detections`].
+    pub detection: usize,
+    /// What the gate measured.
+    pub geometry: PairGeometry,
+}
+
+/// Tracks the objects of one camera. Deterministic: the same calls give the same tracks.
+#[derive(Clone, Debug)]
+pub struct Tracker {
+    config: TrackerConfig,
+    tracks: Vec<Tracklet>,
+    next_id: u64,
+    // The frame in hand, between predict and update.
+    awaiting: bool,
+    size: (f64, f64),
+    time: MediaTime,
+    predicted: Vec<BBox>,
+    detections: Vec<Detection>,
+    embeddings: Vec<Option<Embedding>>,
+    pairs: Vec<GatedPair>,
+}
+
+impl Tracker {
+    /// A tracker without tracks; the first id is 1.
+    pub fn new(config: TrackerConfig) -> Self {
+        Self {
+            config,
+            tracks: Vec::new(),
+            next_id: 1,
+            awaiting: false,
+            size: (0.0, 0.0),
+            time: MediaTime::default(),
+            predicted: Vec::new(),
+            detections: Vec::new(),
+            embeddings: Vec::new(),
+            pairs: Vec::new(),
+        }
+    }
+
+    /// Live tracks, in the order of their ids.
+    pub fn tracks(&self) -> &[Tracklet] {
+        &self.tracks
+    }
+
+    /// The usable detections of the frame in hand; pairs and decisions index into these.
+    pub fn detections(&self) -> &[Detection] {
+        &self.detections
+    }
+
+    /// The gated pairs of the frame in hand, in the order of the request's pairs.
+    pub fn pairs(&self) -> &[GatedPair] {
+        &self.pairs
+    }
+
+    /// The tracks' boxes predicted for the frame in hand.
+    pub fn predicted(&self) -> &[BBox] {
+        &self.predicted
+    }
+
+    /// Takes a frame, moves every track to its time, and writes the pairs that need a link
+    /// probability to `request` (which is emptied first). A time before the last frame's counts as
+    /// the last frame's. A frame that still awaits its scores is given up: it changed no track
+    /// beyond the prediction.
+    pub fn predict(&mut self, frame: FrameInput<'_>, request: &mut LinkRequest) {
+        self.take_detections(&frame);
+        self.awaiting = true;
+        self.size = (frame.width, frame.height);
+        self.time = self.time.max(frame.time);
+        for track in &mut self.tracks {
+            track.predict(self.time, &self.config.filter);
+        }
+        self.follow_camera();
+        for track in &mut self.tracks {
+            track.matched = false;
+        }
+        self.predicted.clear();
+        self.predicted.extend(self.tracks.iter().map(Tracklet::bbox));
+        self.gate_pairs(request);
+    }
+
+    /// Decides the frame in hand by link probabilities, one for each of the request's pairs (a value
+    /// that is not finite counts as 0), and applies the decision.
+    pub fn update(&mut self, links: &[f32]) -> Result<Update, TrackError> {
+        let decision = self.decide(links)?;
+        self.apply(&decision)
+    }
+
+    /// The matches and births that `links` make of the frame in hand.
+    pub fn decide(&self, links: &[f32]) -> Result<Decision, TrackError> {
+        if !self.awaiting {
+            return Err(TrackError::NoFrame);
+        }
+        if links.len() != self.pairs.len() {
+            return Err(TrackError::ScoreCount { expected: self.pairs.len(), got: links.len() });
+        }
+        let links: Vec<f64> = self.pairs.iter().zip(links).map(|(pair, p)| self.link(pair, *p)).collect();
+        let mut matches = Vec::new();
+        let mut track_taken = vec![false; self.tracks.len()];
+        let mut detection_taken = vec![false; self.detections.len()];
+        for confirmed in [true, false] {
+            self.match_stage(confirmed, &links, &mut matches, &mut track_taken, &mut detection_taken);
+        }
+        self.match_low_scores(&mut matches, &mut track_taken, &mut detection_taken);
+        let births = self.births(&matches, &detection_taken);
+        Ok(Decision { matches, births })
+    }
+
+    /// Applies a decision to the frame in hand.
+    ///
+    /// # Panics
+    /// When an index of the decision is out of range.
+    pub fn apply(&mut self, decision: &Decision) -> Result<Update, TrackError> {
+        if !self.awaiting {
+            return Err(TrackError::NoFrame);
+        }
+        self.awaiting = false;
+        for m in &decision.matches {
+            let detection = self.detections[m.detection];
+            self.tracks[m.track].observe(&detection, m.link, self.time, &self.config.filter);
+            self.learn_appearance(m);
+        }
+        for track in &mut self.tracks {
+            track.confirmed |= track.hits >= self.config.life.confirm_hits;
+        }
+        let (width, height) = self.size;
+        let mut ended = Vec::new();
+        let life = self.config.life;
+        self.tracks.retain(|track| {
+            let over = track.is_over(&life, width, height);
+            if over {
+                ended.push(track.id);
+            }
+            !over
+        });
+        for &index in &decision.births {
+            if self.tracks.len() < life.max_tracks {
+                let embedding = self.embeddings.get(index).and_then(Option::as_ref);
+                let id = TrackId(self.next_id);
+                let mut track =
+                    Tracklet::born(id, &self.detections[index], embedding, self.time, &self.config.filter);
+                track.confirmed = life.confirm_hits <= 1;
+                self.tracks.push(track);
+                self.next_id += 1;
+            }
+        }
+        Ok(Update { tracks: self.tracks.iter().map(|t| report(t, &self.config)).collect(), ended })
+    }
+
+    fn take_detections(&mut self, frame: &FrameInput<'_>) {
+        let usable = |d: &Detection| {
+            d.bbox.is_valid() && d.score.is_finite() && d.score >= self.config.association.low_score
+        };
+        let mut order: Vec<usize> =
+            (0..frame.detections.len()).filter(|&i| usable(&frame.detections[i])).collect();
+        if order.len() > self.config.life.max_detections {
+            order.sort_by(|&a, &b| frame.detections[b].score.total_cmp(&frame.detections[a].score));
+            order.truncate(self.config.life.max_detections);
+            order.sort_unstable();
+        }
+        self.detections.clear();
+        self.detections.extend(order.iter().map(|&i| frame.detections[i]));
+        self.embeddings.clear();
+        if frame.embeddings.len() == frame.detections.len() {
+            self.embeddings.extend(order.iter().map(|&i| frame.embeddings[i].clone()));
+        }
+    }
+
+    /// Moves every track by the camera's own motion.
+    fn follow_camera(&mut self) {
+        let config = &self.config.shift;
+        let seen: Vec<BBox> = self
+            .tracks
+            .iter()
+            .filter(|t| t.matched && t.hits >= config.min_hits)
+            .map(Tracklet::bbox)
+            .collect();
+        let high: Vec<BBox> = self
+            .detections
+            .iter()
+            .filter(|d| d.score >= self.config.association.high_score)
+            .map(|d| d.bbox)
+            .collect();
+        if let Some((dx, dy)) = global_shift(config, &seen, &high) {
+            for track in &mut self.tracks {
+                track.shift(dx, dy);
+            }
+        }
+    }
+
+    fn gate_pairs(&mut self, request: &mut LinkRequest) {
+        request.clear();
+        self.pairs.clear();
+        for (index, (track, predicted)) in self.tracks.iter().zip(&self.predicted).enumerate() {
+            let r = track.measurement_noise(&self.config.filter);
+            let first = self.pairs.len();
+            for (d, detection) in self.detections.iter().enumerate() {
+                if detection.score < self.config.association.high_score || detection.class != track.class {
+                    continue;
+                }
+                let open = gate(&self.config.gate, &track.filter, predicted, r, &detection.bbox);
+                if let Some(geometry) = open {
+                    let pair = Pair { track: request.lengths.len() as u32, detection: d as u32 };
+                    request.pairs.push(pair);
+                    request.candidates.extend(features::candidate(track, predicted, detection, &geometry));
+                    self.pairs.push(GatedPair { track: index, detection: d, geometry });
+                }
+            }
+            if self.pairs.len() > first {
+                let valid = features::push_history(track, &mut request.histories);
+                request.lengths.push(valid as i32);
+            }
+        }
+    }
+
+    /// The scorer's probability, moved by appearance where both sides have one.
+    fn link(&self, pair: &GatedPair, probability: f32) -> f64 {
+        let p = if probability.is_finite() { f64::from(probability).clamp(0.0, 1.0) } else { 0.0 };
+        let config = &self.config.appearance;
+        let (Some(a), Some(b)) = (
+            &self.tracks[pair.track].appearance,
+            self.embeddings.get(pair.detection).and_then(Option::as_ref),
+        ) else {
+            return p;
+        };
+        if config.weight == 0.0 {
+            return p;
+        }
+        let p = p.clamp(1e-6, 1.0 - 1e-6);
+        let logit = (p / (1.0 - p)).ln() + config.weight * (a.cosine(b) - config.pivot);
+        1.0 / (1.0 + (-logit).exp())
+    }
+
+    /// How much a match of `pair` is worth; `None` when it must not be.
+    fn gain(&self, pair: &GatedPair, link: f64) -> Option<f64> {
+        let config = &self.config.association;
+        let track = &self.tracks[pair.track];
+        let waited = (track.missed_for() / config.min_link_after).clamp(0.0, 1.0);
+        let min_link = config.min_link + (config.min_link_lost - config.min_link) * waited;
+        if link <= min_link {
+            return None;
+        }
+        let gain = match config.score {
+            PairScore::LogLink => link.ln() - min_link.max(1e-6).ln(),
+            PairScore::Blend { iou_weight } => {
+                let score = self.detections[pair.detection].score;
+                let overlap = pair.geometry.iou * (0.7 + 0.3 * score);
+                let least = if track.confirmed { config.min_score } else { config.min_score_tentative };
+                iou_weight * overlap + (1.0 - iou_weight) * link - least
+            }
+        };
+        (gain > 0.0).then_some(gain)
+    }
+
+    fn match_stage(
+        &self,
+        confirmed: bool,
+        links: &[f64],
+        matches: &mut Vec<Match>,
+        track_taken: &mut [bool],
+        detection_taken: &mut [bool],
+    ) {
+        let mut allowed = Vec::new();
+        let mut source = Vec::new();
+        for (index, (pair, &link)) in self.pairs.iter().zip(links).enumerate() {
+            if self.tracks[pair.track].confirmed != confirmed || detection_taken[pair.detection] {
+                continue;
+            }
+            if let Some(gain) = self.gain(pair, link) {
+                allowed.push((pair.track, pair.detection, gain));
+                source.push(index);
+            }
+        }
+        for chosen in match_pairs(&allowed, self.tracks.len(), self.detections.len()) {
+            let index = source[chosen];
+            let GatedPair { track, detection, .. } = self.pairs[index];
+            track_taken[track] = true;
+            detection_taken[detection] = true;
+            matches.push(Match { track, detection, link: links[index] });
+        }
+    }
+
+    /// Second stage: tracks seen a moment ago may take a low-scored detection, by overlap alone.
+    fn match_low_scores(
+        &self,
+        matches: &mut Vec<Match>,
+        track_taken: &mut [bool],
+        detection_taken: &mut [bool],
+    ) {
+        let config = &self.config.association;
+        if config.second_stage_within <= 0.0 {
+            return;
+        }
+        let mut allowed = Vec::new();
+        for (d, detection) in self.detections.iter().enumerate() {
+            if detection.score >= config.high_score {
+                continue;
+            }
+            for (t, track) in self.tracks.iter().enumerate() {
+                let waiting = track.confirmed
+                    && !track_taken[t]
+                    && track.class == detection.class
+                    && track.missed_for() <= config.second_stage_within;
+                if waiting {
+                    let iou = self.predicted[t].iou(&detection.bbox);
+                    if iou > config.second_stage_iou {
+                        allowed.push((t, d, iou));
+                    }
+                }
+            }
+        }
+        for chosen in match_pairs(&allowed, self.tracks.len(), self.detections.len()) {
+            let (track, detection, iou) = allowed[chosen];
+            track_taken[track] = true;
+            detection_taken[detection] = true;
+            matches.push(Match { track, detection, link: iou * self.detections[detection].score });
+        }
+    }
+
+    fn births(&self, matches: &[Match], detection_taken: &[bool]) -> Vec<usize> {
+        let config = &self.config.birth;
+        let covered =
+            |d: &BBox| matches.iter().any(|m| self.detections[m.detection].bbox.iou(d) > config.max_iou);
+        let mut births: Vec<usize> = (0..self.detections.len())
+            .filter(|&d| {
+                let detection = &self.detections[d];
+                !detection_taken[d] && detection.score >= config.score && !covered(&detection.bbox)
+            })
+            .collect();
+        // Ids follow the boxes, not the detector's order.
+        births.sort_by(|&a, &b| {
+            let key =
+                |i: usize| (-self.detections[i].score, self.detections[i].bbox.x, self.detections[i].bbox.y);
+            let (a, b) = (key(a), key(b));
+            a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.total_cmp(&b.2))
+        });
+        births
+    }
+
+    fn learn_appearance(&mut self, m: &Match) {
+        let Some(Some(seen)) = self.embeddings.get(m.detection) else { return };
+        let config = &self.config.appearance;
+        let bbox = self.detections[m.detection].bbox;
+        let crowded = self
+            .detections
+            .iter()
+            .enumerate()
+            .any(|(i, other)| i != m.detection && other.bbox.iou(&bbox) > config.max_overlap);
+        match &mut self.tracks[m.track].appearance {
+            Some(_) if crowded => {}
+            Some(mean) => mean.blend(seen, config.learning_rate),
+            none => *none = Some(seen.clone()),
+        }
+    }
+}
+
+fn report(track: &Tracklet, config: &TrackerConfig) -> TrackReport {
+    let [vx, vy, ..] = track.filter.velocity();
+    TrackReport {
+        id: track.id,
+        state: track.state(&config.life),
+        class: track.class,
+        bbox: track.bbox(),
+        confidence: track.last().score,
+        link: if track.matched { track.link } else { 0.0 },
+        velocity: [vx, vy],
+        matched: track.matched,
+    }
+}

@@ -1,0 +1,163 @@
+//! One track: its filter, its last observations, its stage of life.
+
+use std::collections::VecDeque;
+
+use super::config::{FilterConfig, LifeConfig};
+use super::kalman::BoxFilter;
+use super::link::HISTORY;
+use super::motion::{measurement_noise, motion, newborn};
+use crate::types::{BBox, ClassId, Detection, Embedding, MediaTime, TrackId, TrackState};
+
+/// One detection that was matched to a track.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Observation {
+    /// The detected box, in the picture's coordinates of now (moved along with the camera).
+    pub bbox: BBox,
+    /// When.
+    pub time: MediaTime,
+    /// The detection's score.
+    pub score: f64,
+    /// `(dx/h, dy/h, ln w/w', ln h/h')` against the box that was predicted for it.
+    pub innovation: [f64; 4],
+}
+
+/// Innovation of `seen` against `predicted`, in units of the predicted box.
+pub fn innovation(predicted: &BBox, seen: &BBox) -> [f64; 4] {
+    let h = predicted.h.max(1.0);
+    [
+        (seen.cx() - predicted.cx()) / h,
+        (seen.cy() - predicted.cy()) / h,
+        (seen.w.max(1.0) / predicted.w.max(1.0)).ln(),
+        (seen.h.max(1.0) / h).ln(),
+    ]
+}
+
+/// A track of one camera.
+#[derive(Clone, Debug)]
+pub struct Tracklet {
+    /// Identity.
+    pub id: TrackId,
+    /// Class of its detections.
+    pub class: ClassId,
+    /// The filter, at [`Tracklet::time`].
+    pub filter: BoxFilter,
+    /// The time that the filter stands at.
+    pub time: MediaTime,
+    /// Up to [`HISTORY`] last observations, the oldest first; never empty.
+    pub history: VecDeque<Observation>,
+    /// Matches so far, birth included.
+    pub hits: u32,
+    /// Whether it was believed once; never taken back.
+    pub confirmed: bool,
+    /// Whether a detection of the current frame was matched.
+    pub matched: bool,
+    /// Link probability of the last match; 1 at birth.
+    pub link: f64,
+    /// Running mean of its embeddings.
+    pub appearance: Option<Embedding>,
+}
+
+impl Tracklet {
+    /// A track born of `detection` at `time`.
+    pub fn born(
+        id: TrackId,
+        detection: &Detection,
+        embedding: Option<&Embedding>,
+        time: MediaTime,
+        config: &FilterConfig,
+    ) -> Self {
+        let bbox = detection.bbox;
+        let mut history = VecDeque::with_capacity(HISTORY);
+        history.push_back(Observation { bbox, time, score: detection.score, innovation: [0.0; 4] });
+        Self {
+            id,
+            class: detection.class,
+            filter: newborn(config, [bbox.cx(), bbox.cy(), bbox.w, bbox.h]),
+            time,
+            history,
+            hits: 1,
+            confirmed: false,
+            matched: true,
+            link: 1.0,
+            appearance: embedding.cloned(),
+        }
+    }
+
+    /// Moves the filter to `time` (Eq. mean_prediction, covariance_prediction with Q*).
+    pub fn predict(&mut self, time: MediaTime, config: &FilterConfig) {
+        let dt = time.since(self.time).max(0.0);
+        let height = self.bbox().h;
+        let link = if !self.matched && config.adaptation.zero_when_missed { 0.0 } else { self.link };
+        let factor = config.adaptation.process_factor(link);
+        self.filter.predict(&motion(config, dt, height, factor));
+        self.time = self.time.max(time);
+    }
+
+    /// The filter's box now; its size is kept at one pixel at least.
+    pub fn bbox(&self) -> BBox {
+        let [cx, cy, w, h] = self.filter.position();
+        BBox::from_center(cx, cy, w.max(1.0), h.max(1.0))
+    }
+
+    /// Measurement noise of a sure match now: diagonal of `R`.
+    pub fn measurement_noise(&self, config: &FilterConfig) -> [f64; 4] {
+        measurement_noise(config, self.bbox().h, 1.0)
+    }
+
+    /// Takes a detection of `link` probability (Eq. mean_update, covariance_update with R*).
+    pub fn observe(&mut self, detection: &Detection, link: f64, time: MediaTime, config: &FilterConfig) {
+        let (predicted, seen) = (self.bbox(), detection.bbox);
+        if self.history.len() == HISTORY {
+            self.history.pop_front();
+        }
+        self.history.push_back(Observation {
+            bbox: seen,
+            time,
+            score: detection.score,
+            innovation: innovation(&predicted, &seen),
+        });
+        let r = measurement_noise(config, predicted.h, config.adaptation.measurement_factor(link));
+        self.filter.update([seen.cx(), seen.cy(), seen.w, seen.h], r);
+        self.hits = self.hits.saturating_add(1);
+        self.matched = true;
+        self.link = link;
+        self.class = detection.class;
+    }
+
+    /// Moves everything that it knows by the camera's shift; velocities stay.
+    pub fn shift(&mut self, dx: f64, dy: f64) {
+        self.filter.axes[0].x[0] += dx;
+        self.filter.axes[1].x[0] += dy;
+        for seen in &mut self.history {
+            seen.bbox = seen.bbox.shifted(dx, dy);
+        }
+    }
+
+    /// The last matched detection.
+    pub fn last(&self) -> &Observation {
+        self.history.back().expect("a track has been seen at least once")
+    }
+
+    /// Seconds since the last match.
+    pub fn missed_for(&self) -> f64 {
+        self.time.since(self.last().time)
+    }
+
+    /// Stage of life.
+    pub fn state(&self, config: &LifeConfig) -> TrackState {
+        match (self.confirmed, self.matched || self.missed_for() <= config.coast) {
+            (false, _) => TrackState::Tentative,
+            (true, true) => TrackState::Confirmed,
+            (true, false) => TrackState::Lost,
+        }
+    }
+
+    /// Whether it ends now: a tentative one missed, one lost for too long, or one that has left the
+    /// `width` x `height` picture.
+    pub fn is_over(&self, config: &LifeConfig, width: f64, height: f64) -> bool {
+        if self.matched {
+            return false;
+        }
+        !self.confirmed || self.missed_for() > config.lost || self.bbox().clipped(width, height).is_none()
+    }
+}
