@@ -1,1 +1,32 @@
-//! mot
+//! MOTChallenge: its files as text, and its figures (HOTA, CLEAR MOT, identity) as TrackEval 1.3.0
+//! computes them for `MotChallenge2DBox`.
+//!
+//! ```text
+//! gt.txt, SEQ.txt -> rows -> preprocess -> hota, clear, identity -> score, per sequence and combined
+//!        rows                                                       score
+//! ```
+//!
+//! Pure: text and numbers in, text and numbers out. [`crate::cli`] reads and writes the files.
+
+mod clear;
+mod hota;
+mod identity;
+mod matching;
+mod matrix;
+mod preprocess;
+mod rows;
+mod score;
+mod seqinfo;
+mod sequence;
+
+pub use clear::Clear;
+pub use hota::{ALPHAS, Hota};
+pub use identity::Identity;
+pub use preprocess::{Benchmark, EvalError};
+pub use rows::{
+    Row, RowError, RowProblem, parse_detections, parse_results, parse_truth, write_detections, write_results,
+    write_truth,
+};
+pub use score::{Score, evaluate};
+pub use seqinfo::{SeqInfoError, SequenceInfo};
+pub use sequence::{Sequence, first_half_length, second_half};
