@@ -21,7 +21,8 @@ fn exp(x: f32) -> f32 {
     let p = p * f + 1.666_666_5e-1;
     let p = p * f + 5e-1;
     let p = p * f * f + f + 1.0;
-    p * f32::from_bits((((n as i32) + 127) as u32) << 23)
+    // The low bits of `shifted` are `n` in two's complement; the shift drops the rest.
+    p * f32::from_bits(shifted.to_bits().wrapping_add(127) << 23)
 }
 
 /// Logistic function `1 / (1 + e^-x)`.

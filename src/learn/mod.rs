@@ -9,6 +9,7 @@
 
 mod activate;
 mod adam;
+pub mod dataset;
 mod examples;
 mod fit;
 mod gemm;
@@ -18,6 +19,7 @@ pub mod metrics;
 mod model;
 pub mod onnx;
 mod scorer;
+mod teacher;
 
 pub use adam::{Adam, Schedule};
 pub use examples::Examples;
@@ -25,3 +27,4 @@ pub use fit::{Fit, Progress, fit, logits};
 pub use gru::{Batch, Gru, GruShape, Tape};
 pub use model::{LinkModel, Normaliser};
 pub use scorer::GruScorer;
+pub use teacher::Teacher;
