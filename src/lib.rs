@@ -26,7 +26,11 @@ pub mod infer;
 pub mod track;
 
 #[cfg(feature = "service")]
+pub mod config;
+#[cfg(feature = "service")]
 pub mod pipeline;
+#[cfg(feature = "service")]
+pub mod telemetry;
 
 #[cfg(feature = "service")]
 pub mod api;

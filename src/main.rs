@@ -1,10 +1,10 @@
 //! The `gakp` binary.
 
+/// 0: done. 2: the arguments, the configuration, a model or an input is wrong; nothing was begun.
 #[cfg(feature = "cli")]
 fn main() -> std::process::ExitCode {
     use clap::Parser as _;
-    let gakp::cli::Command::Eval(args) = gakp::cli::Cli::parse().command;
-    match gakp::cli::eval::run(args) {
+    match gakp::cli::run(gakp::cli::Cli::parse()) {
         Ok(()) => std::process::ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("gakp: {error:#}");
@@ -14,4 +14,7 @@ fn main() -> std::process::ExitCode {
 }
 
 #[cfg(not(feature = "cli"))]
-fn main() {}
+fn main() {
+    eprintln!("gakp: built without its command line; build with the feature `cli`");
+    std::process::exit(2);
+}

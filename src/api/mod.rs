@@ -1,1 +1,94 @@
-//! api
+//! The HTTP and WebSocket edge: cameras over REST, live tracks, live video, health, metrics, the page.
+//!
+//! ```text
+//! /                                the web page
+//! /v1/cameras                      GET list, POST add
+//! /v1/cameras/{id}                 GET status, DELETE
+//! /v1/cameras/{id}/snapshot.jpg    newest picture, boxes drawn in
+//! /v1/cameras/{id}/stream.mjpeg    live pictures, boxes drawn in
+//! /v1/cameras/{id}/live            WebSocket: pictures as they are, each with its tracks
+//! /v1/tracks                       WebSocket: tracks as JSON or protobuf
+//! /metrics /healthz /readyz
+//! ```
+//!
+//! It reads what the pipeline publishes through [`Cameras`] and [`Hub`] and never reaches into it.
+//! docs/api.md is the reference for users.
+
+mod cameras;
+mod live;
+mod page;
+mod problem;
+mod rest;
+mod server;
+mod socket;
+mod tracks;
+mod video;
+
+use std::sync::Arc;
+
+use axum::Router;
+use axum::extract::DefaultBodyLimit;
+use axum::routing::get;
+use prometheus::Registry;
+
+pub use cameras::{
+    CameraError, CameraState, CameraStatus, Cameras, NewCamera, Picture, TrackCounts, Transport,
+};
+pub use server::serve;
+
+use crate::publish::Hub;
+use server::Stop;
+use socket::Seats;
+use video::Studio;
+
+/// Longest body of a request.
+const MAX_BODY_BYTES: usize = 64 * 1024;
+
+/// Why the service is not ready; empty when it is.
+pub type Readiness = Arc<dyn Fn() -> Vec<String> + Send + Sync>;
+
+/// What the API serves.
+#[derive(Clone)]
+pub struct ApiConfig {
+    /// The cameras.
+    pub cameras: Arc<dyn Cameras>,
+    /// The tracks.
+    pub hub: Hub,
+    /// What `/metrics` shows.
+    pub registry: Registry,
+    /// What `/readyz` asks.
+    pub readiness: Readiness,
+}
+
+/// What every handler can reach.
+#[derive(Clone)]
+struct ApiState {
+    cameras: Arc<dyn Cameras>,
+    hub: Hub,
+    registry: Registry,
+    readiness: Readiness,
+    studio: Arc<Studio>,
+    seats: Seats,
+    stop: Stop,
+}
+
+fn router(config: ApiConfig, stop: Stop) -> Router {
+    let ApiConfig { cameras, hub, registry, readiness } = config;
+    let studio = Arc::new(Studio::default());
+    let state = ApiState { cameras, hub, registry, readiness, studio, seats: Seats::default(), stop };
+    Router::new()
+        .route("/v1/cameras", get(rest::list).post(rest::add))
+        .route("/v1/cameras/{id}", get(rest::get).delete(rest::remove))
+        .route("/v1/cameras/{id}/snapshot.jpg", get(live::snapshot))
+        .route("/v1/cameras/{id}/stream.mjpeg", get(live::mjpeg))
+        .route("/v1/cameras/{id}/live", get(live::live))
+        .route("/v1/tracks", get(tracks::tracks))
+        .route("/metrics", get(rest::metrics))
+        .route("/healthz", get(rest::healthz))
+        .route("/readyz", get(rest::readyz))
+        .merge(page::routes())
+        .fallback(rest::no_such_path)
+        .method_not_allowed_fallback(rest::no_such_method)
+        .layer(DefaultBodyLimit::max(MAX_BODY_BYTES))
+        .with_state(state)
+}

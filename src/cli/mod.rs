@@ -1,19 +1,80 @@
-//! The command line.
+//! The command line: one file a subcommand.
 
+#[cfg(feature = "testcam")]
+pub mod camera;
 pub mod eval;
+#[cfg(feature = "service")]
+mod models;
+#[cfg(feature = "service")]
+pub mod serve;
+#[cfg(feature = "service")]
+pub mod track;
+#[cfg(feature = "learn")]
+pub mod train;
 
-/// Arguments of `gakp`.
+use std::io::{self, IsTerminal};
+
+/// Point it at RTSP cameras, subscribe to tracks.
 #[derive(Clone, Debug, clap::Parser)]
-#[command(name = "gakp", version, about)]
+#[command(name = "gakp", version)]
 pub struct Cli {
     /// What to do.
     #[command(subcommand)]
     pub command: Command,
+    /// What to log: error, warn, info, debug, trace, or directives such as `info,gakp::ingest=debug`.
+    #[arg(long, global = true, env = "GAKP_LOG", default_value = "info", value_name = "LEVEL")]
+    pub log: String,
+    /// Log as one JSON object a line.
+    #[arg(long, global = true)]
+    pub log_json: bool,
 }
 
 /// Subcommands.
 #[derive(Clone, Debug, clap::Subcommand)]
 pub enum Command {
+    /// Run the service: cameras in, tracks out.
+    #[cfg(feature = "service")]
+    Serve(serve::Args),
+    /// Track a video, a URL or a MOTChallenge sequence, and write MOTChallenge rows.
+    #[cfg(feature = "service")]
+    Track(track::Args),
     /// Score result files against MOTChallenge ground truth.
     Eval(eval::Args),
+    /// Serve a video as a real RTSP camera, over and over.
+    #[cfg(feature = "testcam")]
+    Camera(camera::Args),
+    /// Train the link scorer on MOTChallenge sequences.
+    #[cfg(feature = "learn")]
+    Train(train::Args),
+}
+
+/// Runs what the command line says.
+///
+/// # Errors
+/// Whatever stops it; the message says what was wrong, where, and what to do.
+pub fn run(cli: Cli) -> anyhow::Result<()> {
+    start_log(&cli.log, cli.log_json)?;
+    match cli.command {
+        #[cfg(feature = "service")]
+        Command::Serve(args) => serve::run(args),
+        #[cfg(feature = "service")]
+        Command::Track(args) => track::run(args),
+        Command::Eval(args) => eval::run(args),
+        #[cfg(feature = "testcam")]
+        Command::Camera(args) => camera::run(args),
+        #[cfg(feature = "learn")]
+        Command::Train(args) => train::run(args),
+    }
+}
+
+/// Logs go to standard error; what a command prints goes to standard output.
+fn start_log(level: &str, json: bool) -> anyhow::Result<()> {
+    let filter = tracing_subscriber::EnvFilter::try_new(level)
+        .map_err(|e| anyhow::anyhow!("--log {level:?}: {e}; use error, warn, info, debug or trace"))?;
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr);
+    let started = match json {
+        true => log.json().try_init(),
+        false => log.with_ansi(io::stderr().is_terminal()).try_init(),
+    };
+    started.map_err(|e| anyhow::anyhow!("cannot start logging: {e}"))
 }

@@ -1,1 +1,38 @@
-//! ingest
+//! Camera -> frames.
+//!
+//! [`start`] opens a [`SourceSpec`] on a thread of its own and hands every decoded frame, and
+//! everything else that happens, to a sink. A camera is reconnected for ever.
+//!
+//! ```text
+//! rtspsrc | urisourcebin | filesrc | v4l2src -> parsebin -> [queue] -> decoder -> videoconvert -> appsink -> sink
+//! ```
+//!
+//! Queues, all bounded: 2 s or 200 frames of encoded video before a camera's decoder (then skipped up
+//! to the next key frame and reported as [`SourceEvent::Skipped`]), 3 decoded frames before the sink
+//! (then the decoder waits). Nothing else is dropped, but for damaged frames ([`SourceEvent::Corrupt`]).
+
+mod backoff;
+mod decoder;
+mod failure;
+mod graph;
+mod pattern;
+mod picture;
+mod source;
+mod spec;
+#[cfg(feature = "testcam")]
+pub mod testcam;
+mod timeline;
+mod url;
+mod writer;
+
+pub use failure::Failure;
+pub use pattern::TestPattern;
+pub use source::{Opened, RawFrame, SourceEvent, SourceHandle, start};
+pub use spec::{Pacing, SourceError, SourceSpec, Transport};
+pub use url::SourceUrl;
+pub use writer::{Pixels, VideoWriter, WriterError};
+
+/// Starts GStreamer, once.
+pub(crate) fn init() -> Result<(), SourceError> {
+    gstreamer::init().map_err(|e| SourceError::Gstreamer(e.to_string()))
+}

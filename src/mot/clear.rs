@@ -28,9 +28,12 @@ pub struct Clear {
 }
 
 impl Clear {
-    /// `1 - (FN + FP + IDSW) / truth boxes`; negative where errors outnumber truth.
+    /// `1 - (FN + FP + IDSW) / truth boxes`; negative where errors outnumber truth, 0 without truth.
     pub fn mota(&self) -> f64 {
-        (self.tp as f64 - self.fp as f64 - self.idsw as f64) / (self.tp + self.fn_).max(1) as f64
+        match self.tp + self.fn_ {
+            0 => 0.0,
+            truth => (self.tp as f64 - self.fp as f64 - self.idsw as f64) / truth as f64,
+        }
     }
 
     /// Mean IoU of the matches, 0 without any.

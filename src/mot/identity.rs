@@ -1,9 +1,9 @@
 //! Identity measures (Ristani et al. 2016, "Performance Measures and a Data Set for Multi-Target,
 //! Multi-Camera Tracking").
 
-use super::matching::best_pairs;
 use super::matrix::Matrix;
 use super::preprocess::Scene;
+use crate::track::assign::assign;
 
 /// Counts under the one matching of truth identities to tracks that is best over the whole sequence.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -57,7 +57,11 @@ impl Identity {
         for (truth, track) in shared() {
             boxes[(truth, column[track])] += 1.0;
         }
-        let tp = best_pairs(&boxes).into_iter().map(|at| boxes[at] as u64).sum();
+        // Only the total counts, so it does not matter which of equal matchings is found.
+        let cost: Vec<f64> = boxes.values.iter().map(|v| -v).collect();
+        let picked = assign(&cost, boxes.rows, boxes.cols);
+        let shared = picked.into_iter().enumerate().filter_map(|(truth, col)| Some(boxes[(truth, col?)]));
+        let tp = shared.sum::<f64>() as u64;
         Self { tp, fn_: scene.truth_boxes() - tp, fp: scene.track_boxes() - tp }
     }
 

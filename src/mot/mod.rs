@@ -14,6 +14,7 @@ mod identity;
 mod matching;
 mod matrix;
 mod preprocess;
+mod replay;
 mod rows;
 mod score;
 mod seqinfo;
@@ -23,6 +24,7 @@ pub use clear::Clear;
 pub use hota::{ALPHAS, Hota};
 pub use identity::Identity;
 pub use preprocess::{Benchmark, EvalError};
+pub use replay::{replay, report_rows, result_rows};
 pub use rows::{
     Row, RowError, RowProblem, parse_detections, parse_results, parse_truth, write_detections, write_results,
     write_truth,

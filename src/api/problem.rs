@@ -1,0 +1,109 @@
+//! Errors as RFC 9457 problem documents.
+
+use axum::Json;
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+
+use super::CameraError;
+use crate::types::CameraIdError;
+
+/// An error as the client sees it: `application/problem+json` with `type`, `title`, `status`, `detail`.
+#[derive(Debug, Serialize)]
+pub(super) struct Problem {
+    /// Names the kind of problem; explained in docs/api.md under its last part.
+    #[serde(rename = "type")]
+    kind: String,
+    title: &'static str,
+    #[serde(serialize_with = "write_status")]
+    status: StatusCode,
+    detail: String,
+}
+
+fn write_status<S: serde::Serializer>(status: &StatusCode, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_u16(status.as_u16())
+}
+
+impl Problem {
+    fn new(status: StatusCode, name: &str, title: &'static str, detail: impl Into<String>) -> Self {
+        Self { kind: format!("urn:gakp:problem:{name}"), title, status, detail: detail.into() }
+    }
+
+    pub fn bad_request(detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::BAD_REQUEST, "bad-request", "The request is not valid", detail)
+    }
+
+    pub fn not_found(detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::NOT_FOUND, "not-found", "Not found", detail)
+    }
+
+    pub fn unknown_camera(name: &str) -> Self {
+        Self::new(
+            StatusCode::NOT_FOUND,
+            "unknown-camera",
+            "No such camera",
+            format!("there is no camera {name:?}; GET /v1/cameras lists them"),
+        )
+    }
+
+    pub fn method_not_allowed(detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::METHOD_NOT_ALLOWED, "method-not-allowed", "Method not allowed", detail)
+    }
+
+    pub fn media_type(detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "media-type", "Unsupported media type", detail)
+    }
+
+    pub fn too_large(detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::PAYLOAD_TOO_LARGE, "too-large", "The body is too large", detail)
+    }
+
+    pub fn upgrade_required(detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::UPGRADE_REQUIRED, "websocket-only", "This path speaks WebSocket", detail)
+    }
+
+    pub fn forbidden_origin(detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::FORBIDDEN, "forbidden-origin", "Origin not allowed", detail)
+    }
+
+    pub fn unavailable(detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::SERVICE_UNAVAILABLE, "unavailable", "Not available now", detail)
+    }
+
+    pub fn internal(detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", "The service failed", detail)
+    }
+}
+
+impl IntoResponse for Problem {
+    fn into_response(self) -> Response {
+        let mut response = (self.status, Json(&self)).into_response();
+        response
+            .headers_mut()
+            .insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
+        response
+    }
+}
+
+impl From<CameraIdError> for Problem {
+    fn from(error: CameraIdError) -> Self {
+        Self::bad_request(error.to_string())
+    }
+}
+
+impl From<CameraError> for Problem {
+    fn from(error: CameraError) -> Self {
+        let detail = error.to_string();
+        match error {
+            CameraError::Exists => Self::new(StatusCode::CONFLICT, "camera-exists", "Camera exists", detail),
+            CameraError::NotFound => {
+                Self::new(StatusCode::NOT_FOUND, "unknown-camera", "No such camera", detail)
+            }
+            CameraError::Invalid(_) => Self::bad_request(detail),
+            CameraError::LimitReached(_) => {
+                Self::new(StatusCode::CONFLICT, "camera-limit", "Too many cameras", detail)
+            }
+            CameraError::Io(_) => Self::internal(detail),
+        }
+    }
+}

@@ -1,0 +1,109 @@
+//! Accepting connections, and ending in order.
+
+use std::io;
+use std::time::Duration;
+
+use axum::Router;
+use hyper::server::conn::http1;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use socket2::SockRef;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+use tokio::time::{sleep, timeout};
+
+use super::{ApiConfig, router};
+
+/// Plain HTTP connections at a time, WebSockets not among them. More wait in the kernel's backlog.
+const MAX_CONNECTIONS: usize = 512;
+/// How long a connection may take to send a request's head, and to sit idle between requests.
+const HEADER_TIMEOUT: Duration = Duration::from_secs(15);
+/// How long sent bytes may stay unacknowledged before the peer counts as dead.
+const PEER_TIMEOUT: Duration = Duration::from_secs(20);
+/// How long connections have to end once the service stops.
+const DRAIN: Duration = Duration::from_millis(1500);
+
+/// Tells long-lived streams that the service stops. While anyone holds one, draining waits for it.
+#[derive(Clone)]
+pub(super) struct Stop(watch::Receiver<bool>);
+
+impl Stop {
+    /// Resolves once the service stops. Cancel safe.
+    pub async fn stopped(&mut self) {
+        // An error means that the server itself is gone: that is stopping too.
+        let _ = self.0.wait_for(|stopping| *stopping).await;
+    }
+
+    /// Whether the service is stopping.
+    pub fn is_stopping(&self) -> bool {
+        *self.0.borrow()
+    }
+}
+
+/// Serves the API on `listener` until `shutdown` resolves. Then it accepts nothing more, lets running
+/// requests finish, closes WebSockets with code 1001, and returns within two seconds.
+///
+/// # Errors
+/// The listener cannot be read at all; errors of single connections are theirs alone.
+pub async fn serve(
+    listener: TcpListener,
+    config: ApiConfig,
+    shutdown: impl Future<Output = ()> + Send,
+) -> io::Result<()> {
+    listener.local_addr()?;
+    let (stop, stopped) = watch::channel(false);
+    let router = router(config, Stop(stopped.clone()));
+    let mut connections = JoinSet::new();
+    let mut shutdown = std::pin::pin!(shutdown);
+    loop {
+        tokio::select! {
+            biased;
+            () = &mut shutdown => break,
+            Some(_) = connections.join_next() => {}
+            accepted = listener.accept(), if connections.len() < MAX_CONNECTIONS => match accepted {
+                Ok((stream, _)) => {
+                    connections.spawn(connection(stream, router.clone(), Stop(stopped.clone())));
+                }
+                Err(error) => {
+                    // Out of file descriptors, or a peer that hung up at once: neither is the end.
+                    tracing::warn!(%error, "a connection could not be accepted");
+                    sleep(Duration::from_millis(100)).await;
+                }
+            },
+        }
+    }
+    drop((listener, router, stopped));
+    stop.send_replace(true);
+    let drained = timeout(DRAIN, async {
+        while connections.join_next().await.is_some() {}
+        stop.closed().await;
+    });
+    if drained.await.is_err() {
+        tracing::warn!("connections were cut off because they did not end in time");
+    }
+    Ok(())
+}
+
+async fn connection(stream: TcpStream, router: Router, mut stop: Stop) {
+    // Frames and tracks are small and wanted at once. A peer that vanished without a word is found
+    // by its bytes that nobody acknowledges.
+    let _ = stream.set_nodelay(true);
+    #[cfg(target_os = "linux")]
+    let _ = SockRef::from(&stream).set_tcp_user_timeout(Some(PEER_TIMEOUT));
+    let service = TowerToHyperService::new(router);
+    let mut builder = http1::Builder::new();
+    builder.timer(TokioTimer::new()).header_read_timeout(HEADER_TIMEOUT);
+    let mut connection =
+        std::pin::pin!(builder.serve_connection(TokioIo::new(stream), service).with_upgrades());
+    let ended = tokio::select! {
+        ended = connection.as_mut() => ended,
+        () = stop.stopped() => {
+            connection.as_mut().graceful_shutdown();
+            connection.await
+        }
+    };
+    if let Err(error) = ended {
+        tracing::debug!(%error, "a connection ended early");
+    }
+}

@@ -1,0 +1,171 @@
+//! What every WebSocket here has in common: who may open one, keep-alive, slow and dead peers, closing.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::extract::ws::rejection::WebSocketUpgradeRejection;
+use axum::extract::ws::{CloseFrame, Message, WebSocket, WebSocketUpgrade, close_code};
+use axum::http::{HeaderMap, header};
+use futures::stream::{SplitSink, SplitStream};
+use futures::{SinkExt, StreamExt};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
+
+use super::problem::Problem;
+use super::server::Stop;
+
+/// Long-lived streams at a time (WebSockets and MJPEG).
+const MAX_STREAMS: usize = 256;
+/// How often a quiet peer is asked whether it is there.
+const PING_EVERY: Duration = Duration::from_secs(10);
+/// A peer that has said nothing for so long, not even pong, is gone.
+const DEAD_AFTER: Duration = Duration::from_secs(30);
+/// A peer that takes no byte for so long is gone.
+pub(super) const SEND_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long a closing peer has to answer.
+const CLOSE_TIMEOUT: Duration = Duration::from_millis(500);
+/// Longest message taken from a client: none is expected, pongs have at most 125 bytes.
+const MAX_INCOMING: usize = 4096;
+
+/// Bounds the streams that are open at a time.
+#[derive(Clone)]
+pub(super) struct Seats(Arc<Semaphore>);
+
+impl Default for Seats {
+    fn default() -> Self {
+        Self(Arc::new(Semaphore::new(MAX_STREAMS)))
+    }
+}
+
+impl Seats {
+    /// A seat for one stream, free again when dropped.
+    pub fn take(&self) -> Result<OwnedSemaphorePermit, Problem> {
+        self.0.clone().try_acquire_owned().map_err(|_| {
+            Problem::unavailable(format!(
+                "{MAX_STREAMS} streams are open, which is the limit; try again later"
+            ))
+        })
+    }
+}
+
+/// Takes the upgrade if it is one and its origin may: a page of another site must not read tracks or
+/// pictures through its visitor's browser. Clients that are no browser send no `Origin`.
+pub(super) fn upgrade(
+    headers: &HeaderMap,
+    upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
+) -> Result<WebSocketUpgrade, Problem> {
+    let upgrade = upgrade.map_err(|rejection| {
+        Problem::upgrade_required(format!("open it with a WebSocket client: {}", rejection.body_text()))
+    })?;
+    if !same_origin(headers) {
+        return Err(Problem::forbidden_origin(
+            "a browser may open this WebSocket only from a page of this service",
+        ));
+    }
+    Ok(upgrade.max_message_size(MAX_INCOMING).max_frame_size(MAX_INCOMING))
+}
+
+fn same_origin(headers: &HeaderMap) -> bool {
+    let Some(origin) = headers.get(header::ORIGIN) else { return true };
+    let text = |value: &axum::http::HeaderValue| value.to_str().ok().map(str::to_ascii_lowercase);
+    let Some(origin) = text(origin) else { return false };
+    let host = headers.get(header::HOST).and_then(text);
+    // The scheme is not compared: behind a proxy that ends TLS it differs.
+    let authority = origin.strip_prefix("http://").or_else(|| origin.strip_prefix("https://"));
+    authority.is_some() && authority == host.as_deref()
+}
+
+/// What a socket sends.
+pub(super) trait Outgoing: Send {
+    /// The next message; `None` at the end. Cancel safe.
+    fn next(&mut self) -> impl Future<Output = Option<Message>> + Send;
+
+    /// What to say when [`Outgoing::next`] ended: close code and reason.
+    fn farewell(&self) -> (u16, &'static str) {
+        (close_code::NORMAL, "the stream ended")
+    }
+}
+
+/// Sends what `outgoing` has until it ends, the peer goes, or the service stops.
+pub(super) async fn run(socket: WebSocket, mut stop: Stop, mut outgoing: impl Outgoing) {
+    let (mut sender, mut receiver) = socket.split();
+    let mut ping = interval(PING_EVERY);
+    ping.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut heard = Instant::now();
+    let (code, reason) = loop {
+        let message = tokio::select! {
+            biased;
+            () = stop.stopped() => break (close_code::AWAY, "the service stops"),
+            incoming = receiver.next() => match incoming {
+                // The library answers pings and closes by itself.
+                Some(Ok(Message::Close(_)) | Err(_)) | None => return,
+                Some(Ok(_)) => {
+                    heard = Instant::now();
+                    continue;
+                }
+            },
+            _ = ping.tick() => {
+                if heard.elapsed() > DEAD_AFTER {
+                    return;
+                }
+                Message::Ping(Default::default())
+            }
+            message = outgoing.next() => match message {
+                Some(message) => message,
+                None => break outgoing.farewell(),
+            },
+        };
+        tokio::select! {
+            sent = timeout(SEND_TIMEOUT, sender.send(message)) => {
+                if !matches!(sent, Ok(Ok(()))) {
+                    return;
+                }
+            }
+            // In the middle of a message there is no saying goodbye.
+            () = stop.stopped() => return,
+        }
+    };
+    let _ = timeout(CLOSE_TIMEOUT, close(&mut sender, &mut receiver, code, reason)).await;
+}
+
+/// Says goodbye and reads on until the peer has answered; closing with unread bytes would reset the
+/// connection and lose the goodbye.
+async fn close(
+    sender: &mut SplitSink<WebSocket, Message>,
+    receiver: &mut SplitStream<WebSocket>,
+    code: u16,
+    reason: &'static str,
+) {
+    let goodbye = Message::Close(Some(CloseFrame { code, reason: reason.into() }));
+    if sender.send(goodbye).await.is_ok() {
+        while let Some(Ok(_)) = receiver.next().await {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_our_own_pages_may_connect() {
+        for (host, origin, allowed) in [
+            ("cam:8080", None, true),
+            ("cam:8080", Some("http://cam:8080"), true),
+            ("cam:8080", Some("http://CAM:8080"), true),
+            ("cam", Some("https://cam"), true),
+            ("[::1]:80", Some("http://[::1]:80"), true),
+            ("cam:8080", Some("http://cam:8081"), false),
+            ("cam:8080", Some("http://evil.example"), false),
+            ("cam:8080", Some("http://cam:8080.evil.example"), false),
+            ("cam:8080", Some("null"), false),
+            ("cam:8080", Some("file://cam:8080"), false),
+        ] {
+            let mut headers = HeaderMap::new();
+            headers.insert(header::HOST, host.parse().unwrap());
+            if let Some(origin) = origin {
+                headers.insert(header::ORIGIN, origin.parse().unwrap());
+            }
+            assert_eq!(same_origin(&headers), allowed, "{host} {origin:?}");
+        }
+    }
+}

@@ -1,0 +1,205 @@
+//! `gakp serve`: arguments and configuration, checks, start, run, drain.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail};
+use tokio::net::TcpListener;
+use tokio::signal::unix::{SignalKind, signal};
+
+use super::models::ModelArgs;
+use crate::api::{self, ApiConfig, NewCamera};
+use crate::config::Config;
+use crate::infer::Models;
+use crate::pipeline::{CameraSet, Lanes, MAX_CAMERAS, SetConfig, Store, source_spec};
+use crate::publish::{Hub, HubConfig};
+use crate::telemetry::Metrics;
+use crate::track::TrackerConfig;
+use crate::types::CameraId;
+
+/// Runs the service: cameras in, tracks out.
+///
+/// Cameras come from the configuration, from --camera, and at run time from POST /v1/cameras; the
+/// latter are remembered in the state folder. SIGTERM drains and ends; a second one ends at once.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Args {
+    /// Configuration file (TOML).
+    #[arg(long, short, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Address of the API and the page [default: 127.0.0.1:8080].
+    #[arg(long, env = "GAKP_LISTEN", value_name = "ADDR")]
+    listen: Option<SocketAddr>,
+    /// A camera, as NAME=URL: rtsp://, rtsps://, http(s)://, a file, v4l2:///dev/video0, test:. Repeatable.
+    #[arg(long = "camera", value_name = "NAME=URL", value_parser = camera)]
+    cameras: Vec<NewCamera>,
+    /// Play files given with --camera over and over.
+    #[arg(long = "loop")]
+    looped: bool,
+    /// Where cameras added at run time are remembered [default: $STATE_DIRECTORY, $XDG_STATE_HOME/gakp
+    /// or ~/.local/state/gakp].
+    #[arg(long, value_name = "DIR")]
+    state_dir: Option<PathBuf>,
+    /// Most cameras at a time [default: 64].
+    #[arg(long, value_name = "N")]
+    max_cameras: Option<usize>,
+    #[command(flatten)]
+    models: ModelArgs,
+}
+
+/// How long draining may take before the service ends anyway.
+const DRAIN: Duration = Duration::from_millis(4500);
+
+/// Runs the service until it is told to end.
+///
+/// # Errors
+/// A setting, a model, the address or the state folder is wrong; no camera was opened then.
+pub fn run(args: Args) -> Result<()> {
+    let plan = Plan::new(args)?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .thread_name("async")
+        .worker_threads(2)
+        .enable_all()
+        .build()
+        .context("cannot start the async runtime")?;
+    let done = runtime.block_on(serve(plan));
+    // What still blocks (a camera that does not answer its TEARDOWN) is left behind.
+    runtime.shutdown_timeout(Duration::from_millis(200));
+    done
+}
+
+/// Everything that can be checked without opening anything.
+struct Plan {
+    listen: SocketAddr,
+    cameras: Vec<NewCamera>,
+    store: (Store, crate::pipeline::Remembered),
+    limit: usize,
+    tracker: TrackerConfig,
+    models: crate::infer::ModelSettings,
+}
+
+impl Plan {
+    fn new(args: Args) -> Result<Self> {
+        let config = args.config.as_deref().map(Config::read).transpose()?.unwrap_or_default();
+        let mut cameras = config.cameras;
+        for camera in args.cameras {
+            if cameras.iter().any(|c| c.id == camera.id) {
+                bail!("two cameras are named {:?}: names must differ", camera.id.as_str());
+            }
+            cameras.push(NewCamera { looped: args.looped, ..camera });
+        }
+        for camera in &cameras {
+            source_spec(camera)
+                .and_then(|spec| spec.check())
+                .with_context(|| format!("camera {:?}", camera.id.as_str()))?;
+        }
+        let limit = args.max_cameras.or(config.max_cameras).unwrap_or(64);
+        if limit == 0 || limit > MAX_CAMERAS {
+            bail!("max_cameras is {limit}: must be from 1 to {MAX_CAMERAS}");
+        }
+        if cameras.len() > limit {
+            bail!("{} cameras are configured, but max_cameras is {limit}", cameras.len());
+        }
+        let state_dir = args.state_dir.or(config.state_dir).or_else(default_state_dir).context(
+            "no state folder: neither STATE_DIRECTORY nor XDG_STATE_HOME nor HOME is set; give --state-dir",
+        )?;
+        Ok(Self {
+            listen: args.listen.or(config.listen).unwrap_or(SocketAddr::from(([127, 0, 0, 1], 8080))),
+            cameras,
+            store: Store::open(&state_dir)?,
+            limit,
+            tracker: config.tracker.apply(TrackerConfig::default())?,
+            models: crate::config::ModelConfig::from(args.models).or(config.models).settings()?,
+        })
+    }
+}
+
+async fn serve(plan: Plan) -> Result<()> {
+    let mut ended = Ended::listen()?;
+    let metrics = Metrics::new().context("cannot set up the metrics")?;
+    // Loading models takes seconds on a GPU and blocks.
+    let (settings, observer) = (plan.models, metrics.clone());
+    let models = tokio::task::spawn_blocking(move || Models::load(&settings, observer)).await??;
+    metrics.provider(models.report.provider);
+    let listener = TcpListener::bind(plan.listen).await.with_context(|| {
+        format!("cannot listen on {}: choose another address with --listen", plan.listen)
+    })?;
+    let address = listener.local_addr()?;
+    let hub = Hub::new(HubConfig::default(), models.detector.classes().into());
+    hub.metrics().register(metrics.registry())?;
+    let set = CameraSet::new(SetConfig {
+        lanes: Lanes::start(models, metrics.clone())?,
+        hub: hub.clone(),
+        metrics: metrics.clone(),
+        tracker: plan.tracker,
+        store: Some(plan.store),
+        limit: plan.limit,
+    });
+    for camera in plan.cameras {
+        let id = camera.id.clone();
+        set.start_configured(camera).await.with_context(|| format!("camera {:?}", id.as_str()))?;
+    }
+    set.start_remembered().await;
+    tracing::info!("the page is at http://{address}/");
+    let config = ApiConfig {
+        cameras: set.clone(),
+        hub: hub.clone(),
+        registry: metrics.registry().clone(),
+        // Models are warm before the port is bound: who can ask finds the service ready.
+        readiness: Arc::new(Vec::new),
+    };
+    let served = api::serve(listener, config, ended.once()).await;
+    tracing::info!("draining");
+    let drain = async {
+        hub.close();
+        set.shutdown().await;
+    };
+    tokio::select! {
+        drained = tokio::time::timeout(DRAIN, drain) => {
+            if drained.is_err() {
+                tracing::warn!("draining took too long; ending anyway");
+            }
+        }
+        () = ended.again() => tracing::warn!("told twice; ending at once"),
+    }
+    served.context("the HTTP server failed")
+}
+
+/// SIGTERM and SIGINT.
+struct Ended {
+    term: tokio::signal::unix::Signal,
+    int: tokio::signal::unix::Signal,
+}
+
+impl Ended {
+    fn listen() -> Result<Self> {
+        let listen = |kind| signal(kind).context("cannot listen for signals");
+        Ok(Self { term: listen(SignalKind::terminate())?, int: listen(SignalKind::interrupt())? })
+    }
+
+    async fn again(&mut self) {
+        tokio::select! {
+            _ = self.term.recv() => {}
+            _ = self.int.recv() => {}
+        }
+    }
+
+    /// Resolves at the first signal.
+    async fn once(&mut self) {
+        self.again().await;
+    }
+}
+
+fn camera(text: &str) -> Result<NewCamera, String> {
+    let (id, url) = text.split_once('=').ok_or("write NAME=URL, such as gate=rtsp://10.0.0.2/stream1")?;
+    let id = CameraId::new(id).map_err(|e| e.to_string())?;
+    Ok(NewCamera { id, url: url.into(), transport: None, looped: false })
+}
+
+fn default_state_dir() -> Option<PathBuf> {
+    let set = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+    set("STATE_DIRECTORY")
+        .or_else(|| set("XDG_STATE_HOME").map(|dir| dir.join("gakp")))
+        .or_else(|| set("HOME").map(|dir| dir.join(".local/state/gakp")))
+}

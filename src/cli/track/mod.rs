@@ -1,0 +1,120 @@
+//! `gakp track`: offline tracking of a video, a URL or a MOTChallenge sequence.
+
+mod progress;
+mod sequence;
+mod video;
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+
+use super::models::ModelArgs;
+use crate::config::{Config, ModelConfig};
+use crate::infer::ModelSettings;
+use crate::track::TrackerConfig;
+
+/// Tracks a video, a URL or a MOTChallenge sequence, and writes MOTChallenge rows.
+///
+/// A folder is taken as a MOTChallenge sequence: its det/det.txt holds the detections and no video is
+/// needed. Anything else is what `gakp serve` takes as a camera, played as fast as it goes.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Args {
+    /// Video file, URL, or MOTChallenge sequence folder. Several folders: --out is then a folder.
+    #[arg(required = true, value_name = "INPUT")]
+    inputs: Vec<String>,
+    /// File to write rows to (frame,id,x,y,w,h,confidence,-1,-1,-1); `-` is standard output. For
+    /// several inputs a folder, one file SEQ.txt each.
+    #[arg(long, short, value_name = "FILE")]
+    out: PathBuf,
+    /// Also write the video with boxes, ids and trails drawn in.
+    #[arg(long, value_name = "OUT.mp4")]
+    video: Option<PathBuf>,
+    /// Stop after this many frames (needed for a live camera; otherwise Ctrl-C ends it).
+    #[arg(long, value_name = "N")]
+    frames: Option<u64>,
+    /// Of a MOTChallenge sequence, track frames after L/2 + 1, renumbered from 1.
+    #[arg(long)]
+    second_half: bool,
+    /// Configuration file: its [models] and [tracker] hold here too.
+    #[arg(long, short, value_name = "FILE")]
+    config: Option<PathBuf>,
+    #[command(flatten)]
+    models: ModelArgs,
+}
+
+/// What every kind of input needs.
+struct Job {
+    tracker: TrackerConfig,
+    models: ModelSettings,
+    frames: Option<u64>,
+    second_half: bool,
+    video: Option<PathBuf>,
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// An input, a model or a setting is wrong, or the output cannot be written.
+pub fn run(args: Args) -> Result<()> {
+    let config = args.config.as_deref().map(Config::read).transpose()?.unwrap_or_default();
+    let job = Job {
+        tracker: config.tracker.apply(TrackerConfig::default())?,
+        models: ModelConfig::from(args.models).or(config.models).settings()?,
+        frames: args.frames,
+        second_half: args.second_half,
+        video: args.video,
+    };
+    let folders = args.inputs.iter().filter(|input| Path::new(input).is_dir()).count();
+    if folders > 0 && folders < args.inputs.len() {
+        bail!("inputs are sequence folders and videos mixed: give one kind");
+    }
+    if folders > 0 && job.video.is_some() {
+        bail!("--video needs a video: a MOTChallenge sequence folder has detections only");
+    }
+    match args.inputs.as_slice() {
+        [input] if folders == 0 => {
+            if job.second_half {
+                bail!("--second-half is for MOTChallenge sequence folders");
+            }
+            let mut out = Output::create(&args.out)?;
+            video::track(input, &job, &mut out)
+        }
+        [folder] => {
+            let mut out = Output::create(&args.out)?;
+            sequence::track(Path::new(folder), &job, &mut out)
+        }
+        _ if folders == 0 => bail!("several inputs must be MOTChallenge sequence folders"),
+        inputs => {
+            std::fs::create_dir_all(&args.out)
+                .with_context(|| format!("cannot make the folder {}", args.out.display()))?;
+            sequence::track_all(inputs, &args.out, &job)
+        }
+    }
+}
+
+/// Where rows go.
+struct Output {
+    name: String,
+    file: Box<dyn Write>,
+}
+
+impl Output {
+    fn create(path: &Path) -> Result<Self> {
+        let name = path.display().to_string();
+        if name == "-" {
+            return Ok(Self { name: "standard output".into(), file: Box::new(std::io::stdout().lock()) });
+        }
+        let file = std::fs::File::create(path).with_context(|| format!("cannot write {name}"))?;
+        Ok(Self { name, file: Box::new(std::io::BufWriter::new(file)) })
+    }
+
+    fn write(&mut self, rows: &[crate::mot::Row]) -> Result<()> {
+        let text = crate::mot::write_results(rows);
+        self.file.write_all(text.as_bytes()).with_context(|| format!("cannot write {}", self.name))
+    }
+
+    fn finish(&mut self) -> Result<()> {
+        self.file.flush().with_context(|| format!("cannot write {}", self.name))
+    }
+}

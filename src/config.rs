@@ -1,0 +1,302 @@
+//! Settings: the TOML file, merged with the command line, checked before anything is opened.
+//!
+//! Unknown keys are errors. What the file leaves out has the default that the core gives it.
+
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail, ensure};
+use serde::Deserialize;
+
+use crate::api::NewCamera;
+use crate::detect::DetectorSettings;
+use crate::infer::ModelSettings;
+use crate::track::{PairScore, TrackerConfig};
+
+/// The whole file.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// Address of the API and the page.
+    pub listen: Option<SocketAddr>,
+    /// Where cameras that were added at run time are remembered.
+    pub state_dir: Option<PathBuf>,
+    /// Most cameras at a time.
+    pub max_cameras: Option<usize>,
+    /// Models and where they run.
+    pub models: ModelConfig,
+    /// The tracker's settings.
+    pub tracker: TrackerOptions,
+    /// Cameras.
+    #[serde(rename = "camera")]
+    pub cameras: Vec<NewCamera>,
+}
+
+/// `[models]`.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ModelConfig {
+    /// Manifest file or its folder.
+    pub manifest: Option<PathBuf>,
+    /// Detector: `auto`, a name in the manifest, or the user's own (`own.toml#name`).
+    pub detector: Option<String>,
+    /// Largest detector input, `[width, height]`.
+    pub detector_size: Option<(usize, usize)>,
+    /// Least score of a detection.
+    pub score_threshold: Option<f64>,
+    /// Classes to track, by the manifest's names.
+    pub classes: Option<Vec<String>>,
+    /// ReID: `builtin`, `none`, a name, or the user's own.
+    pub reid: Option<String>,
+    /// Link scorer: a name, or the user's own.
+    pub link: Option<String>,
+    /// `auto`, `cpu`, `cuda`, `tensorrt`.
+    pub provider: Option<String>,
+    /// CPU cores for models.
+    pub threads: Option<usize>,
+    /// ONNX Runtime's library.
+    pub onnxruntime: Option<PathBuf>,
+}
+
+/// `[tracker]`: what users change; see [`TrackerConfig`] for the meaning.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrackerOptions {
+    /// Detections from this score on take part in the first matching stage.
+    pub high_score: Option<f64>,
+    /// Detections below this score are ignored.
+    pub low_score: Option<f64>,
+    /// Least score of a birth.
+    pub birth_score: Option<f64>,
+    /// Hits until a track is confirmed.
+    pub confirm_hits: Option<u32>,
+    /// How long a missed track stays confirmed, seconds.
+    pub coast_s: Option<f64>,
+    /// How long a lost track is kept, seconds.
+    pub lost_s: Option<f64>,
+    /// Whether the camera may move.
+    pub camera_motion: Option<bool>,
+    /// `blend` (link probability and overlap) or `log-link` (the paper's `-ln P`).
+    pub cost: Option<String>,
+    /// `lambda_c` of Eq. Q* and R*.
+    pub lambda_c: Option<f64>,
+    /// Whether Q and R adapt to the link probability.
+    pub adapt_noise: Option<bool>,
+    /// The Mahalanobis gate, squared distance.
+    pub gate: Option<f64>,
+    /// Gate by the paper's literal `H P H'` instead of the innovation covariance.
+    pub literal_gate: Option<bool>,
+    /// Logits that a unit of cosine similarity moves the link probability by; 0 ignores appearance.
+    pub appearance_weight: Option<f64>,
+    /// The cosine similarity that says nothing either way.
+    pub appearance_pivot: Option<f64>,
+}
+
+impl Config {
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// The file cannot be read, is no TOML, or has an unknown key or a wrong value; the message names
+    /// the line.
+    pub fn read(path: &Path) -> Result<Self> {
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("cannot read the configuration {}", path.display()))?;
+        Self::parse(&text).with_context(|| format!("in the configuration {}", path.display()))
+    }
+
+    /// Reads a text.
+    ///
+    /// # Errors
+    /// As [`Config::read`].
+    pub fn parse(text: &str) -> Result<Self> {
+        let config: Config = toml::from_str(text).map_err(|error| {
+            // The snippet that TOML's error quotes may hold a camera's password.
+            let line = error.span().map_or(0, |span| text[..span.start.min(text.len())].matches('\n').count() + 1);
+            anyhow::anyhow!("line {line}: {}", error.message())
+        })?;
+        config.tracker.apply(TrackerConfig::default())?;
+        let mut names: Vec<_> = config.cameras.iter().map(|c| c.id.as_str()).collect();
+        names.sort_unstable();
+        if let Some(twice) = names.windows(2).find(|w| w[0] == w[1]) {
+            bail!("two cameras are named {:?}: names must differ", twice[0]);
+        }
+        Ok(config)
+    }
+}
+
+impl ModelConfig {
+    /// What `self` says, and `other` where `self` says nothing.
+    pub fn or(self, other: ModelConfig) -> ModelConfig {
+        ModelConfig {
+            manifest: self.manifest.or(other.manifest),
+            detector: self.detector.or(other.detector),
+            detector_size: self.detector_size.or(other.detector_size),
+            score_threshold: self.score_threshold.or(other.score_threshold),
+            classes: self.classes.or(other.classes),
+            reid: self.reid.or(other.reid),
+            link: self.link.or(other.link),
+            provider: self.provider.or(other.provider),
+            threads: self.threads.or(other.threads),
+            onnxruntime: self.onnxruntime.or(other.onnxruntime),
+        }
+    }
+
+    /// As settings for [`crate::infer::Models::load`].
+    ///
+    /// # Errors
+    /// A provider that does not exist, or no core at all.
+    pub fn settings(self) -> Result<ModelSettings> {
+        let default = ModelSettings::default();
+        ensure!(self.threads != Some(0), "models.threads is 0: give at least 1, or leave it out");
+        Ok(ModelSettings {
+            manifest: self.manifest.unwrap_or_else(default_manifest),
+            detector: self.detector.unwrap_or(default.detector),
+            detection: DetectorSettings {
+                size: self.detector_size,
+                score_threshold: self.score_threshold,
+                classes: self.classes.unwrap_or_default(),
+            },
+            reid: self.reid.unwrap_or(default.reid),
+            link: self.link.unwrap_or(default.link),
+            provider: match self.provider {
+                Some(name) => name.parse()?,
+                None => default.provider,
+            },
+            threads: self.threads,
+            onnxruntime: self.onnxruntime,
+        })
+    }
+}
+
+/// `models/` here, beside the program (or its build folder), or where a package puts it.
+fn default_manifest() -> PathBuf {
+    let beside = std::env::current_exe().ok();
+    let beside = beside.iter().flat_map(|exe| exe.ancestors().skip(1).take(3)).map(|dir| dir.join("models"));
+    [PathBuf::from("models")]
+        .into_iter()
+        .chain(beside)
+        .chain([PathBuf::from("/usr/share/gakp/models")])
+        .find(|dir| dir.join("manifest.toml").is_file())
+        .unwrap_or_else(|| "models".into())
+}
+
+impl TrackerOptions {
+    /// `base` with what these options change.
+    ///
+    /// # Errors
+    /// A value out of its range; the message names the key.
+    pub fn apply(&self, mut base: TrackerConfig) -> Result<TrackerConfig> {
+        let unit = |key: &str, value: Option<f64>, into: &mut f64| -> Result<()> {
+            if let Some(value) = value {
+                ensure!((0.0..=1.0).contains(&value), "tracker.{key} = {value}: must be from 0 to 1");
+                *into = value;
+            }
+            Ok(())
+        };
+        let positive = |key: &str, value: Option<f64>, into: &mut f64| -> Result<()> {
+            if let Some(value) = value {
+                ensure!(value.is_finite() && value > 0.0, "tracker.{key} = {value}: must be more than 0");
+                *into = value;
+            }
+            Ok(())
+        };
+        unit("high_score", self.high_score, &mut base.association.high_score)?;
+        unit("low_score", self.low_score, &mut base.association.low_score)?;
+        unit("birth_score", self.birth_score, &mut base.birth.score)?;
+        positive("lost_s", self.lost_s, &mut base.life.lost)?;
+        positive("lambda_c", self.lambda_c, &mut base.filter.adaptation.lambda)?;
+        positive("gate", self.gate, &mut base.gate.mahalanobis)?;
+        if let Some(coast) = self.coast_s {
+            ensure!((0.0..=base.life.lost).contains(&coast), "tracker.coast_s = {coast}: must be from 0 to lost_s");
+            base.life.coast = coast;
+        }
+        if let Some(hits) = self.confirm_hits {
+            ensure!(hits >= 1, "tracker.confirm_hits = 0: must be at least 1");
+            base.life.confirm_hits = hits;
+        }
+        if let Some(moves) = self.camera_motion {
+            base.shift.enabled = moves;
+        }
+        match self.cost.as_deref() {
+            None => {}
+            Some("blend") => base.association.score = PairScore::Blend { iou_weight: 0.3 },
+            Some("log-link") => base.association.score = PairScore::LogLink,
+            Some(other) => bail!("tracker.cost = {other:?}: must be \"blend\" or \"log-link\""),
+        }
+        if let Some(adapt) = self.adapt_noise {
+            base.filter.adaptation.process = adapt;
+            base.filter.adaptation.measurement = adapt;
+        }
+        if let Some(literal) = self.literal_gate {
+            base.gate.innovation = !literal;
+        }
+        if let Some(weight) = self.appearance_weight {
+            ensure!(weight.is_finite() && weight >= 0.0, "tracker.appearance_weight = {weight}: must not be negative");
+            base.appearance.weight = weight;
+        }
+        if let Some(pivot) = self.appearance_pivot {
+            ensure!((-1.0..=1.0).contains(&pivot), "tracker.appearance_pivot = {pivot}: must be from -1 to 1");
+            base.appearance.pivot = pivot;
+        }
+        Ok(base)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_whole_file() {
+        let config = Config::parse(
+            r#"
+            listen = "127.0.0.1:8080"
+            [models]
+            provider = "cpu"
+            detector_size = [416, 352]
+            [tracker]
+            lost_s = 3.0
+            coast_s = 2.5
+            cost = "log-link"
+            [[camera]]
+            id = "gate"
+            url = "rtsp://user:secret@10.0.0.2/stream1"
+            transport = "tcp"
+            [[camera]]
+            id = "loop"
+            url = "clip.mp4"
+            loop = true
+            "#,
+        )
+        .unwrap();
+        assert_eq!(config.cameras.len(), 2);
+        assert_eq!(config.models.detector_size, Some((416, 352)));
+        let tracker = config.tracker.apply(TrackerConfig::default()).unwrap();
+        assert_eq!((tracker.life.lost, tracker.life.coast), (3.0, 2.5));
+        assert_eq!(tracker.association.score, PairScore::LogLink);
+    }
+
+    #[test]
+    fn mistakes_are_named() {
+        for (text, expected) in [
+            ("liste = 1", "unknown field `liste`"),
+            ("[models]\nthread = 2", "line 2: unknown field `thread`"),
+            ("[[camera]]\nid = \"a b\"\nurl = \"x\"", "not usable"),
+            ("[[camera]]\nid = \"a\"\nurl = \"x\"\n[[camera]]\nid = \"a\"\nurl = \"y\"", "two cameras are named \"a\""),
+            ("[tracker]\nhigh_score = 7", "tracker.high_score = 7: must be from 0 to 1"),
+            ("[tracker]\ncost = \"x\"", "must be \"blend\" or \"log-link\""),
+            ("[tracker]\nlost_s = nan", "tracker.lost_s"),
+            ("listen = \"here\"", "invalid socket address"),
+        ] {
+            let message = format!("{:#}", Config::parse(text).unwrap_err());
+            assert!(message.contains(expected), "{text:?} gave {message:?}");
+        }
+    }
+
+    #[test]
+    fn a_mistake_does_not_quote_passwords() {
+        let text = "[[camera]]\nid = \"a\"\nurl = \"rtsp://u:hunter2@h/s\"\ntransprot = \"tcp\"";
+        let message = format!("{:#}", Config::parse(text).unwrap_err());
+        assert!(message.contains("transprot") && !message.contains("hunter2"), "{message}");
+    }
+}

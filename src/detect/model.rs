@@ -1,0 +1,211 @@
+//! The detector as a batched model: frames in, boxes out.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::decode::{Decoder, Wanted};
+use super::letterbox::Letterbox;
+use super::nms::{Candidate, suppress};
+use super::{DetectorSettings, grey};
+use crate::infer::{
+    Arrangement, BatchModel, InferError, InputSpec, ModelEntry, Normalisation, PictureGraph, Rasteriser,
+    Runtime,
+};
+use crate::types::{BBox, ClassId, Detection, Image};
+
+/// A detector's entry and the user's settings, checked against each other.
+#[derive(Debug)]
+pub(crate) struct DetectSpec {
+    input: InputSpec,
+    /// Largest input, width and height.
+    size: (usize, usize),
+    /// Whether the input may be smaller where the frame's shape allows.
+    shrink: bool,
+    decoder: Decoder,
+    nms_iou: f32,
+    /// The model's class names.
+    pub classes: Vec<String>,
+}
+
+impl DetectSpec {
+    pub(crate) fn new(entry: &ModelEntry, settings: &DetectorSettings) -> Result<Self, InferError> {
+        let wrong = |setting, reason: String| InferError::Setting { setting, reason };
+        let (Some(input), Some(output)) = (&entry.input, &entry.output) else {
+            return Err(InferError::Graph { name: entry.name.clone(), reason: "it is no detector".into() });
+        };
+        let dynamic = input.shape[2].fixed().is_none() && input.shape[3].fixed().is_none();
+        let size = settings.size.unwrap_or((input.width, input.height));
+        if size != (input.width, input.height) && !dynamic {
+            return Err(wrong(
+                "detector size",
+                format!("{:?} takes {}x{} pictures only", entry.name, input.width, input.height),
+            ));
+        }
+        let possible = |length: usize| length > 0 && length <= 8192 && length.is_multiple_of(input.multiple);
+        if !possible(size.0) || !possible(size.1) {
+            return Err(wrong(
+                "detector size",
+                format!("{}x{}: both must be multiples of {}, at most 8192", size.0, size.1, input.multiple),
+            ));
+        }
+        let threshold = settings.score_threshold.or(output.score_threshold).unwrap_or(0.5);
+        if !(threshold > 0.0 && threshold < 1.0) {
+            return Err(wrong("detector threshold", format!("{threshold} is not between 0 and 1")));
+        }
+        for class in &settings.classes {
+            if !output.classes.contains(class) {
+                let known = output.classes.join(", ");
+                return Err(wrong(
+                    "detector classes",
+                    format!("{:?} has no class {class:?}; it has: {known}", entry.name),
+                ));
+            }
+        }
+        let wanted = |(index, class)| match settings.classes.is_empty() {
+            true => index == 0,
+            false => settings.classes.contains(class),
+        };
+        Ok(Self {
+            input: input.clone(),
+            size,
+            shrink: dynamic,
+            decoder: Decoder {
+                family: entry.family,
+                strides: output.strides.clone(),
+                wanted: Wanted {
+                    threshold: threshold as f32,
+                    classes: output.classes.iter().enumerate().map(wanted).collect(),
+                },
+            },
+            nms_iou: output.nms_iou.unwrap_or(0.6) as f32,
+            classes: output.classes.clone(),
+        })
+    }
+
+    fn letterbox(&self, image: &Image) -> Letterbox {
+        Letterbox::new(&self.input, self.size, (image.width, image.height), self.shrink)
+    }
+}
+
+/// One instance of a detector.
+pub(crate) struct DetectModel {
+    graph: PictureGraph,
+    spec: Arc<DetectSpec>,
+    normalisation: Normalisation,
+    rasteriser: Rasteriser,
+    /// Pictures that one call of the graph may hold.
+    most: usize,
+    tensor: Vec<f32>,
+    candidates: Vec<Candidate>,
+    last: Duration,
+}
+
+impl DetectModel {
+    pub(crate) fn load(
+        runtime: &Runtime,
+        entry: &ModelEntry,
+        file: &Path,
+        arrangement: Arrangement,
+        spec: Arc<DetectSpec>,
+    ) -> Result<Self, InferError> {
+        let graph = PictureGraph::load(runtime, entry, file, arrangement, spec.size)?;
+        Ok(Self {
+            graph,
+            normalisation: Normalisation::new(&spec.input),
+            rasteriser: Rasteriser::new(),
+            most: spec.input.shape[0].fixed().unwrap_or(arrangement.max_batch).max(1),
+            spec,
+            tensor: vec![],
+            candidates: vec![],
+            last: Duration::ZERO,
+        })
+    }
+
+    /// Runs once, so that the first frame does not pay for what is made lazily and a graph that gives
+    /// another shape than its family's is found now.
+    pub(crate) fn warm_up(&mut self) -> Result<(), InferError> {
+        let (width, height) = self.spec.size;
+        self.run(&[grey(width as u32, height as u32)]).map(drop)
+    }
+
+    /// Writes a frame's tensor; where it lies in it.
+    pub(super) fn prepare(&mut self, image: &Image, at: usize) -> Letterbox {
+        let letterbox = self.spec.letterbox(image);
+        let length = 3 * letterbox.place.width * letterbox.place.height;
+        if self.tensor.len() < (at + 1) * length {
+            self.tensor.resize((at + 1) * length, 0.0);
+        }
+        let whole = BBox::new(0.0, 0.0, image.width.into(), image.height.into());
+        let tensor = &mut self.tensor[at * length..(at + 1) * length];
+        self.rasteriser.write(image, whole, letterbox.place, &self.normalisation, tensor);
+        letterbox
+    }
+
+    /// Runs frames whose tensors have one shape.
+    fn run_alike(&mut self, images: &[&Image]) -> Result<Vec<Vec<Detection>>, InferError> {
+        let letterboxes: Vec<Letterbox> =
+            images.iter().enumerate().map(|(at, image)| self.prepare(image, at)).collect();
+        let (width, height) = (letterboxes[0].place.width, letterboxes[0].place.height);
+        let (spec, candidates) = (&self.spec, &mut self.candidates);
+        let shape = [images.len(), 3, height, width];
+        let tensor = &self.tensor[..shape.iter().product()];
+        self.graph.run(shape, tensor, |axes, output| {
+            let &[batch, rows, columns] = axes else {
+                return Err(format!("the output has the shape {axes:?}, three axes are expected"));
+            };
+            let (rows, columns) = (rows as usize, columns as usize);
+            if batch as usize != images.len() {
+                return Err(format!("{batch} outputs for {} frames", images.len()));
+            }
+            let mut answers = Vec::with_capacity(images.len());
+            for (index, letterbox) in letterboxes.iter().enumerate() {
+                let output = &output[index * rows * columns..][..rows * columns];
+                candidates.clear();
+                spec.decoder.decode(output, [rows, columns], (width, height), candidates)?;
+                suppress(candidates, spec.nms_iou);
+                answers.push(candidates.iter().filter_map(|c| detection(letterbox, c)).collect());
+            }
+            Ok(answers)
+        })
+    }
+}
+
+/// A candidate in the frame; a box without an area is none.
+fn detection(letterbox: &Letterbox, candidate: &Candidate) -> Option<Detection> {
+    let bbox = letterbox.to_frame(candidate.corners);
+    let score = f64::from(candidate.score).min(1.0);
+    bbox.is_valid().then_some(Detection { bbox, score, class: ClassId(candidate.class) })
+}
+
+impl BatchModel for DetectModel {
+    type Job = Image;
+    type Answer = Vec<Detection>;
+
+    fn run(&mut self, jobs: &[Image]) -> Result<Vec<Vec<Detection>>, InferError> {
+        self.graph.take_time();
+        // Frames of one shape share a call of the graph.
+        let sizes: Vec<(usize, usize)> = jobs
+            .iter()
+            .map(|image| self.spec.letterbox(image).place)
+            .map(|place| (place.width, place.height))
+            .collect();
+        let mut order: Vec<usize> = (0..jobs.len()).collect();
+        order.sort_by_key(|&index| sizes[index]);
+        let mut answers = vec![vec![]; jobs.len()];
+        for alike in order.chunk_by(|&a, &b| sizes[a] == sizes[b]) {
+            for some in alike.chunks(self.most) {
+                let images: Vec<&Image> = some.iter().map(|&index| &jobs[index]).collect();
+                for (&index, found) in some.iter().zip(self.run_alike(&images)?) {
+                    answers[index] = found;
+                }
+            }
+        }
+        self.last = self.graph.take_time();
+        Ok(answers)
+    }
+
+    fn session_time(&self) -> Duration {
+        self.last
+    }
+}

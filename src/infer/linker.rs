@@ -1,0 +1,200 @@
+//! The link scorer: histories of tracks and candidate detections to link probabilities.
+//!
+//! The graph takes `histories` f32 `[T, 6, 14]`, `lengths` i32 `[T]`, `candidates` f32 `[P, 20]` and
+//! `pair_track` i64 `[P]` (which history a candidate belongs to) and gives `probability` f32 `[P]`.
+//! Requests of several cameras are joined by concatenation; `pair_track` moves by the tracks before it.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use ort::session::Session;
+use ort::value::{TensorElementType, TensorRef};
+
+use super::graph::check_type;
+use super::manifest::ModelEntry;
+use super::runtime::Runtime;
+use super::{Arrangement, BatchModel, Batcher, InferError, Observer, Task};
+use crate::track::{CANDIDATE_FEATURES, HISTORY, LinkRequest, STEP_FEATURES};
+
+const MODEL: &str = Task::Link.as_str();
+const INPUTS: [(&str, TensorElementType); 4] = [
+    ("histories", TensorElementType::Float32),
+    ("lengths", TensorElementType::Int32),
+    ("candidates", TensorElementType::Float32),
+    ("pair_track", TensorElementType::Int64),
+];
+const OUTPUT: &str = "probability";
+
+/// Scores link requests. Clones share the model.
+#[derive(Clone)]
+pub struct Linker {
+    batcher: Arc<Batcher<LinkModel>>,
+}
+
+impl Linker {
+    /// Starts the workers.
+    pub(super) fn start(
+        runtime: &Runtime,
+        entry: &ModelEntry,
+        file: &Path,
+        arrangement: Arrangement,
+        observer: Arc<dyn Observer>,
+    ) -> Result<Self, InferError> {
+        let (runtime, name, file) = (runtime.clone(), entry.name.clone(), file.to_path_buf());
+        let batcher = Batcher::start(MODEL, arrangement, observer, move |_| {
+            let mut model = LinkModel::load(&runtime, &name, &file)?;
+            model.run(&[warm_up()])?;
+            Ok(model)
+        })?;
+        Ok(Self { batcher: Arc::new(batcher) })
+    }
+
+    /// The probabilities of a request's pairs, in their order, each in `[0, 1]`. An empty request is
+    /// answered at once.
+    ///
+    /// # Errors
+    /// [`InferError::Request`] when the request's parts do not fit each other, or the model's failure.
+    pub async fn score(&self, request: LinkRequest) -> Result<Vec<f32>, InferError> {
+        check(&request)?;
+        if request.is_empty() {
+            return Ok(vec![]);
+        }
+        self.batcher.submit(request).await
+    }
+
+    /// [`Linker::score`] for a thread that may wait.
+    ///
+    /// # Errors
+    /// As [`Linker::score`].
+    pub fn score_blocking(&self, request: LinkRequest) -> Result<Vec<f32>, InferError> {
+        futures::executor::block_on(self.score(request))
+    }
+
+    /// Requests in the queue now.
+    pub fn depth(&self) -> usize {
+        self.batcher.depth()
+    }
+
+    /// Stops taking requests, answers those in the queue and joins the workers.
+    pub fn shutdown(&self) {
+        self.batcher.shutdown();
+    }
+}
+
+/// What the graph relies on: ONNX Runtime would read past a tensor or stop the process.
+fn check(request: &LinkRequest) -> Result<(), InferError> {
+    let (tracks, pairs) = (request.tracks(), request.pairs.len());
+    let reason = if request.histories.len() != tracks * HISTORY * STEP_FEATURES {
+        format!("{} history values for {tracks} tracks", request.histories.len())
+    } else if request.candidates.len() != pairs * CANDIDATE_FEATURES {
+        format!("{} candidate values for {pairs} pairs", request.candidates.len())
+    } else if let Some(pair) = request.pairs.iter().find(|pair| pair.track as usize >= tracks) {
+        format!("a pair of track {} among {tracks} tracks", pair.track)
+    } else if let Some(length) = request.lengths.iter().find(|&&n| n < 1 || n as usize > HISTORY) {
+        format!("a history of {length} observations, 1 to {HISTORY} are possible")
+    } else {
+        return Ok(());
+    };
+    Err(InferError::Request { model: MODEL, reason })
+}
+
+fn warm_up() -> LinkRequest {
+    LinkRequest {
+        histories: vec![0.0; HISTORY * STEP_FEATURES],
+        lengths: vec![1],
+        candidates: vec![0.0; CANDIDATE_FEATURES],
+        pairs: vec![crate::track::Pair { track: 0, detection: 0 }],
+    }
+}
+
+struct LinkModel {
+    session: Session,
+    /// The joined request of a batch.
+    joined: LinkRequest,
+    pair_track: Vec<i64>,
+    last: Duration,
+}
+
+impl LinkModel {
+    fn load(runtime: &Runtime, name: &str, file: &Path) -> Result<Self, InferError> {
+        let wrong = |reason: String| InferError::Graph { name: name.into(), reason };
+        let session = runtime.session(name, file, None)?;
+        for (input, element) in INPUTS {
+            let outlet = session.inputs().iter().find(|outlet| outlet.name() == input);
+            let outlet = outlet.ok_or_else(|| wrong(format!("it has no input {input:?}")))?;
+            check_type("input", outlet, element).map_err(wrong)?;
+        }
+        if session.inputs().len() != INPUTS.len() {
+            return Err(wrong(format!(
+                "it has {} inputs, {} are expected",
+                session.inputs().len(),
+                INPUTS.len()
+            )));
+        }
+        let outlet = session.outputs().iter().find(|outlet| outlet.name() == OUTPUT);
+        let outlet = outlet.ok_or_else(|| wrong(format!("it has no output {OUTPUT:?}")))?;
+        check_type("output", outlet, TensorElementType::Float32).map_err(wrong)?;
+        Ok(Self { session, joined: LinkRequest::default(), pair_track: vec![], last: Duration::ZERO })
+    }
+
+    /// Runs the joined request; `None` when ONNX Runtime gives fewer or more probabilities than pairs.
+    fn probabilities(&mut self) -> ort::Result<Option<Vec<f32>>> {
+        let (tracks, pairs) = (self.joined.tracks(), self.pair_track.len());
+        let joined = &self.joined;
+        let outputs = self.session.run(ort::inputs![
+            "histories" => TensorRef::from_array_view(([tracks, HISTORY, STEP_FEATURES], &joined.histories[..]))?,
+            "lengths" => TensorRef::from_array_view(([tracks], &joined.lengths[..]))?,
+            "candidates" => TensorRef::from_array_view(([pairs, CANDIDATE_FEATURES], &joined.candidates[..]))?,
+            "pair_track" => TensorRef::from_array_view(([pairs], &self.pair_track[..]))?,
+        ])?;
+        let (_, values) = outputs[OUTPUT].try_extract_tensor::<f32>()?;
+        Ok((values.len() == pairs).then(|| values.to_vec()))
+    }
+}
+
+impl BatchModel for LinkModel {
+    type Job = LinkRequest;
+    type Answer = Vec<f32>;
+
+    fn run(&mut self, jobs: &[LinkRequest]) -> Result<Vec<Vec<f32>>, InferError> {
+        self.joined.clear();
+        self.pair_track.clear();
+        for job in jobs {
+            let before = self.joined.tracks() as i64;
+            self.joined.histories.extend(&job.histories);
+            self.joined.lengths.extend(&job.lengths);
+            self.joined.candidates.extend(&job.candidates);
+            self.pair_track.extend(job.pairs.iter().map(|pair| before + i64::from(pair.track)));
+        }
+        let failed = |reason: String| InferError::Run { model: MODEL, reason };
+        if self.pair_track.is_empty() {
+            // ONNX Runtime's GRU stops the whole process on an empty batch.
+            return Ok(vec![vec![]; jobs.len()]);
+        }
+        let start = Instant::now();
+        let all = self.probabilities().map_err(|error| failed(error.to_string()))?;
+        self.last = start.elapsed();
+        let all = all.ok_or_else(|| failed("not one probability a pair".into()))?;
+        if let Some(odd) = all.iter().find(|p| !(0.0..=1.0).contains(*p)) {
+            return Err(failed(format!("{odd} is no probability")));
+        }
+        let mut rest = &all[..];
+        Ok(jobs
+            .iter()
+            .map(|job| {
+                let (own, others) = rest.split_at(job.pairs.len());
+                rest = others;
+                own.to_vec()
+            })
+            .collect())
+    }
+
+    fn items(job: &LinkRequest) -> usize {
+        job.pairs.len()
+    }
+
+    fn session_time(&self) -> Duration {
+        self.last
+    }
+}

@@ -1,0 +1,307 @@
+//! A test camera: a file, served over real RTSP as often as one likes.
+//!
+//! The file's encoded frames lie in memory; every client gets a media of its own, so that it sees the
+//! video from its first frame on. With UDP or TCP, with or without a password, with RTCP sender
+//! reports. [`TestCamera::kill_clients`] and [`TestCamera::freeze`] misbehave on purpose.
+
+mod feed;
+mod footage;
+
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener};
+use std::path::PathBuf;
+use std::sync::{Arc, mpsc};
+use std::thread::JoinHandle;
+
+use gstreamer as gst;
+use gstreamer::glib;
+use gstreamer_app as gst_app;
+use gstreamer_rtsp_server as rtsp;
+use gstreamer_rtsp_server::prelude::*;
+
+use feed::Feeds;
+use footage::Footage;
+
+/// What a test camera sends.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Codec {
+    /// H.264 / AVC.
+    H264,
+    /// H.265 / HEVC.
+    H265,
+}
+
+impl Codec {
+    fn media_type(self) -> &'static str {
+        match self {
+            Codec::H264 => "video/x-h264",
+            Codec::H265 => "video/x-h265",
+        }
+    }
+}
+
+/// What to serve, and where.
+#[derive(Clone)]
+pub struct TestCameraConfig {
+    /// The video.
+    pub file: PathBuf,
+    /// Address and port; port 0 takes a free one.
+    pub listen: SocketAddr,
+    /// The path of the URL; begins with a slash.
+    pub path: String,
+    /// A user and a password that clients must give.
+    pub login: Option<(String, String)>,
+    /// What to send. `None`: the file's own codec if it is one of them, else H.264.
+    pub codec: Option<Codec>,
+    /// Frames per second instead of the file's own.
+    pub fps: Option<f64>,
+    /// Begin again at the end, for ever; otherwise the stream ends.
+    pub looped: bool,
+}
+
+impl TestCameraConfig {
+    /// A file on a free port of the loopback interface, looped, at `/live`.
+    pub fn new(file: impl Into<PathBuf>) -> Self {
+        Self {
+            file: file.into(),
+            listen: (Ipv4Addr::LOCALHOST, 0).into(),
+            path: "/live".into(),
+            login: None,
+            codec: None,
+            fps: None,
+            looped: true,
+        }
+    }
+}
+
+/// Why a test camera does not start.
+#[derive(Debug, thiserror::Error)]
+pub enum TestCameraError {
+    /// The file cannot be opened.
+    #[error("cannot open video {path:?}: {source}")]
+    File {
+        /// Which.
+        path: String,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The file cannot be used.
+    #[error("cannot serve {path:?}: {what}")]
+    Video {
+        /// Which.
+        path: String,
+        /// Why.
+        what: String,
+    },
+    /// A part of GStreamer is not installed.
+    #[error("cannot serve video: {0}")]
+    Missing(String),
+    /// The address cannot be listened on.
+    #[error("cannot listen on {address}: {source}")]
+    Listen {
+        /// Where.
+        address: SocketAddr,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A setting out of range.
+    #[error("bad test camera setting: {0}")]
+    Setting(String),
+}
+
+/// A running test camera. Dropping it stops it.
+pub struct TestCamera {
+    address: SocketAddr,
+    path: String,
+    user: Option<String>,
+    frames: usize,
+    codec: Codec,
+    server: rtsp::RTSPServer,
+    feeds: Arc<Feeds>,
+    context: glib::MainContext,
+    main_loop: glib::MainLoop,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl TestCamera {
+    /// Reads the file (transcoding it if need be) and listens.
+    pub fn start(config: TestCameraConfig) -> Result<Self, TestCameraError> {
+        crate::ingest::init().map_err(|e| TestCameraError::Missing(e.to_string()))?;
+        if !config.path.starts_with('/') || config.path.contains(['?', '#', ' ']) {
+            return Err(TestCameraError::Setting(format!(
+                "path {:?}: it begins with / and is plain",
+                config.path
+            )));
+        }
+        if config.fps.is_some_and(|fps| !(0.1..=240.0).contains(&fps)) {
+            return Err(TestCameraError::Setting("fps must be 0.1 to 240".into()));
+        }
+        // GStreamer does not say why it cannot listen; asked before the work of reading the file.
+        let taken = |source| TestCameraError::Listen { address: config.listen, source };
+        TcpListener::bind(config.listen).map_err(taken)?;
+        let footage = Arc::new(footage::load(&config.file, config.codec, config.fps)?);
+        let (frames, codec) = (footage.units.len(), footage.codec);
+
+        let server = rtsp::RTSPServer::new();
+        server.set_address(&config.listen.ip().to_string());
+        server.set_service(&config.listen.port().to_string());
+        let feeds = Arc::new(Feeds::default());
+        let factory = factory(footage, config.looped, feeds.clone());
+        if let Some((user, password)) = &config.login {
+            require_login(&server, &factory, user, password);
+        }
+        let mounts =
+            server.mount_points().ok_or_else(|| TestCameraError::Missing("no mount points".into()))?;
+        mounts.add_factory(&config.path, factory);
+
+        let context = glib::MainContext::new();
+        let main_loop = glib::MainLoop::new(Some(&context), false);
+        let (ready, attached) = mpsc::sync_channel(1);
+        let (running, looping, serving) = (context.clone(), main_loop.clone(), server.clone());
+        let thread = std::thread::Builder::new().name("test-camera".into()).spawn(move || {
+            let served = running.with_thread_default(|| {
+                let source = serving.attach(Some(&running));
+                let attached = source.is_ok();
+                // The other end waits for it.
+                let _ = ready.send(attached);
+                if attached {
+                    looping.run();
+                }
+                // SourceId::remove would look in the default context, and panic.
+                if let Some(source) = source.ok().and_then(|id| running.find_source_by_id(&id)) {
+                    source.destroy();
+                }
+            });
+            if served.is_err() {
+                tracing::error!("the test camera's main context belongs to another thread");
+            }
+        });
+        let thread = thread.map_err(taken)?;
+        if !attached.recv().unwrap_or(false) {
+            return Err(taken(std::io::Error::other("the RTSP server does not start")));
+        }
+        let port = u16::try_from(server.bound_port()).unwrap_or(config.listen.port());
+        Ok(Self {
+            address: (config.listen.ip(), port).into(),
+            path: config.path,
+            user: config.login.map(|(user, _)| user),
+            frames,
+            codec,
+            server,
+            feeds,
+            context,
+            main_loop,
+            thread: Some(thread),
+        })
+    }
+
+    /// The URL for clients, without the password (`user:***@` where one is needed).
+    pub fn url(&self) -> String {
+        let login = self.user.as_ref().map(|user| format!("{user}:***@")).unwrap_or_default();
+        self.url_with(&login)
+    }
+
+    /// The URL with something (`user:password@`) before the host.
+    pub fn url_with(&self, login: &str) -> String {
+        let ip = match self.address.ip() {
+            IpAddr::V4(ip) if ip.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
+            IpAddr::V6(ip) if ip.is_unspecified() => Ipv6Addr::LOCALHOST.into(),
+            ip => ip,
+        };
+        format!("rtsp://{login}{}{}", SocketAddr::from((ip, self.address.port())), self.path)
+    }
+
+    /// Where it listens.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Frames of one round.
+    pub fn frames(&self) -> usize {
+        self.frames
+    }
+
+    /// What is sent.
+    pub fn codec(&self) -> Codec {
+        self.codec
+    }
+
+    /// Sends nothing more to anybody, connections staying open; `false` goes on where it stopped.
+    pub fn freeze(&self, frozen: bool) {
+        self.feeds.freeze(frozen);
+    }
+
+    /// Cuts every client off; they may come again.
+    pub fn kill_clients(&self) {
+        let server = self.server.clone();
+        self.in_server_thread(move || {
+            server.client_filter(Some(&mut |_, _| rtsp::RTSPFilterResult::Remove));
+        });
+    }
+
+    /// Cuts every client off and stops listening.
+    pub fn stop(mut self) {
+        self.shut_down();
+    }
+
+    fn shut_down(&mut self) {
+        if let Some(thread) = self.thread.take() {
+            self.kill_clients();
+            let main_loop = self.main_loop.clone();
+            self.in_server_thread(move || main_loop.quit());
+            // A panic there was already reported.
+            let _ = thread.join();
+        }
+    }
+
+    /// Runs a piece of work where the server lives, and waits for it.
+    fn in_server_thread(&self, work: impl FnOnce() + Send + 'static) {
+        let (done, wait) = mpsc::sync_channel(1);
+        self.context.invoke(move || {
+            work();
+            // The other end waits for it.
+            let _ = done.send(());
+        });
+        // An error means that the server is gone, and with it the work.
+        let _ = wait.recv_timeout(std::time::Duration::from_secs(5));
+    }
+}
+
+impl Drop for TestCamera {
+    fn drop(&mut self) {
+        self.shut_down();
+    }
+}
+
+/// Makes a media for every client: an appsrc, fed from memory, and a payloader.
+fn factory(footage: Arc<Footage>, looped: bool, feeds: Arc<Feeds>) -> rtsp::RTSPMediaFactory {
+    let factory = rtsp::RTSPMediaFactory::new();
+    let payloader = match footage.codec {
+        Codec::H264 => "rtph264pay aggregate-mode=zero-latency",
+        Codec::H265 => "rtph265pay aggregate-mode=zero-latency",
+    };
+    factory.set_launch(&format!("( appsrc name=feed ! {payloader} name=pay0 pt=96 config-interval=-1 )"));
+    factory.set_shared(false);
+    factory.connect_media_configure(move |_, media| {
+        let feed = media.element().downcast::<gst::Bin>().ok().and_then(|bin| bin.by_name("feed"));
+        let Some(source) = feed.and_then(|feed| feed.downcast::<gst_app::AppSrc>().ok()) else {
+            tracing::error!("the test camera's media has no appsrc");
+            return;
+        };
+        feeds.add(&source, footage.clone(), looped);
+    });
+    factory
+}
+
+/// Digest authentication, as cameras do.
+fn require_login(server: &rtsp::RTSPServer, factory: &rtsp::RTSPMediaFactory, user: &str, password: &str) {
+    let auth = rtsp::RTSPAuth::new();
+    auth.set_supported_methods(rtsp::gst_rtsp::RTSPAuthMethod::Digest);
+    let token = rtsp::RTSPToken::builder().field("media.factory.role", "viewer").build();
+    auth.add_digest(user, password, &token);
+    server.set_auth(Some(&auth));
+    let role = gst::Structure::builder("viewer")
+        .field("media.factory.access", true)
+        .field("media.factory.construct", true)
+        .build();
+    factory.add_role_from_structure(&role);
+}

@@ -1,0 +1,39 @@
+//! Where tracked frames go.
+
+use std::sync::Arc;
+
+use tokio::sync::{mpsc, watch};
+
+use crate::api::Picture;
+use crate::publish::Hub;
+
+/// Takes tracked frames, on the tracker's thread.
+pub trait Outlet: Send {
+    /// Takes one frame with its tracks.
+    fn emit(&mut self, picture: Picture);
+}
+
+/// The service's outlet: never waits.
+pub struct LiveOutlet {
+    /// Subscribers to tracks.
+    pub hub: Hub,
+    /// Watchers of the picture see the newest.
+    pub video: watch::Sender<Option<Arc<Picture>>>,
+}
+
+impl Outlet for LiveOutlet {
+    fn emit(&mut self, picture: Picture) {
+        self.hub.publish(picture.tracks.clone());
+        self.video.send_replace(Some(Arc::new(picture)));
+    }
+}
+
+/// The offline outlet: every frame, in order; the tracker waits for its reader.
+pub struct Collector(pub mpsc::Sender<Picture>);
+
+impl Outlet for Collector {
+    fn emit(&mut self, picture: Picture) {
+        // A reader that went away wants no more; the source is being stopped.
+        let _ = self.0.blocking_send(picture);
+    }
+}

@@ -1,0 +1,276 @@
+//! The cameras of a service: added and removed while it runs, remembered, shown to the API.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
+
+use futures::FutureExt;
+use futures::future::BoxFuture;
+use jiff::Timestamp;
+use tokio::sync::watch;
+
+use super::camera::{Camera, CameraPlan, CameraState, CameraView, Lanes, MAX_CAMERAS, StartError};
+use super::mailbox::Policy;
+use super::outlet::LiveOutlet;
+use super::store::{Remembered, Store};
+use crate::api::{self, CameraError, CameraStatus, Cameras, NewCamera, Picture, TrackCounts};
+use crate::ingest::{Pacing, SourceError, SourceSpec, Transport};
+use crate::publish::Hub;
+use crate::telemetry::{DropReason, Metrics};
+use crate::track::TrackerConfig;
+use crate::types::{CameraId, Epoch};
+
+/// What a [`CameraSet`] is made of.
+pub struct SetConfig {
+    /// The shared stages.
+    pub lanes: Lanes,
+    /// Where tracks go.
+    pub hub: Hub,
+    /// What is measured.
+    pub metrics: Arc<Metrics>,
+    /// How to track.
+    pub tracker: TrackerConfig,
+    /// Where cameras are remembered, and what was; `None` forgets them.
+    pub store: Option<(Store, Remembered)>,
+    /// Most cameras at a time; at most [`MAX_CAMERAS`].
+    pub limit: usize,
+}
+
+/// The cameras of a service.
+pub struct CameraSet {
+    lanes: Lanes,
+    hub: Hub,
+    metrics: Arc<Metrics>,
+    tracker: TrackerConfig,
+    limit: usize,
+    shown: Mutex<BTreeMap<CameraId, Shown>>,
+    /// Serialises changes; readers need only `shown`.
+    changes: tokio::sync::Mutex<Changes>,
+}
+
+/// What the API reads of a camera.
+#[derive(Clone)]
+struct Shown {
+    url: String,
+    view: Arc<CameraView>,
+    video: watch::Receiver<Option<Arc<Picture>>>,
+}
+
+struct Changes {
+    cameras: BTreeMap<CameraId, Camera>,
+    store: Option<Store>,
+    remembered: Remembered,
+    stopping: bool,
+}
+
+impl CameraSet {
+    /// An empty set. Cameras that are remembered start with [`CameraSet::start_remembered`].
+    pub fn new(config: SetConfig) -> Arc<Self> {
+        let SetConfig { lanes, hub, metrics, tracker, store, limit } = config;
+        let (store, remembered) = store.map_or((None, Remembered::default()), |(s, r)| (Some(s), r));
+        let changes = Changes { cameras: BTreeMap::new(), store, remembered, stopping: false };
+        Arc::new(Self {
+            lanes,
+            hub,
+            metrics,
+            tracker,
+            limit: limit.min(MAX_CAMERAS),
+            shown: Mutex::default(),
+            changes: tokio::sync::Mutex::new(changes),
+        })
+    }
+
+    /// Starts a camera that the configuration names; it is not remembered, the configuration does that.
+    ///
+    /// # Errors
+    /// As [`Cameras::add`].
+    pub async fn start_configured(&self, camera: NewCamera) -> Result<CameraStatus, CameraError> {
+        self.start(camera, false).await
+    }
+
+    /// Starts the cameras that are remembered. One that cannot start is told and stays remembered.
+    pub async fn start_remembered(&self) {
+        let remembered = self.changes.lock().await.remembered.cameras.clone();
+        for camera in remembered {
+            let id = camera.id.clone();
+            if let Err(error) = self.start(camera, false).await {
+                tracing::error!(camera = %id, %error, "a remembered camera cannot start");
+            }
+        }
+    }
+
+    /// Stops every camera, then the shared stages.
+    pub async fn shutdown(self: Arc<Self>) {
+        let cameras = {
+            let mut changes = self.changes.lock().await;
+            changes.stopping = true;
+            std::mem::take(&mut changes.cameras)
+        };
+        futures::future::join_all(cameras.into_values().map(Camera::stop)).await;
+        self.shown().clear();
+        // Whoever still reads the set lets the stages end when it lets go.
+        if let Some(set) = Arc::into_inner(self) {
+            set.lanes.shutdown().await;
+        }
+    }
+
+    async fn start(&self, camera: NewCamera, remember: bool) -> Result<CameraStatus, CameraError> {
+        let spec = source_spec(&camera).map_err(|e| CameraError::Invalid(e.to_string()))?;
+        let mut changes = self.changes.lock().await;
+        if changes.stopping {
+            return Err(CameraError::Invalid("the service is stopping".into()));
+        }
+        if changes.cameras.contains_key(&camera.id) {
+            return Err(CameraError::Exists);
+        }
+        if changes.cameras.len() >= self.limit {
+            return Err(CameraError::LimitReached(self.limit));
+        }
+        spec.check().map_err(|e| CameraError::Invalid(e.to_string()))?;
+        let before = changes.remembered.clone();
+        changes.remembered.epoch = next_epoch(before.epoch);
+        let epoch = Epoch(changes.remembered.epoch);
+        if remember {
+            changes.remembered.cameras.push(camera.clone());
+        }
+        // First on disk, so that what was accepted is never forgotten.
+        if let Some(store) = &changes.store
+            && let Err(error) = store.save(&changes.remembered)
+        {
+            changes.remembered = before;
+            return Err(CameraError::Io(error.to_string()));
+        }
+        let (video, watched) = watch::channel(None);
+        let url = spec.url.redacted().to_string();
+        let plan = CameraPlan {
+            id: camera.id.clone(),
+            epoch,
+            spec,
+            tracker: self.tracker.clone(),
+            outlet: Box::new(LiveOutlet { hub: self.hub.clone(), video }),
+            policy: Policy::NewestWins,
+        };
+        let running = match Camera::start(&self.lanes, plan).await {
+            Ok(running) => running,
+            Err(error) => {
+                self.metrics.forget_camera(&camera.id);
+                if remember {
+                    changes.remembered.cameras.retain(|c| c.id != camera.id);
+                    self.save(&changes)?;
+                }
+                return Err(match error {
+                    StartError::Source(error) => CameraError::Invalid(error.to_string()),
+                    StartError::Tracker(error) => CameraError::Io(error.to_string()),
+                });
+            }
+        };
+        let shown = Shown { url, view: running.view().clone(), video: watched };
+        let status = status(&shown);
+        self.shown().insert(camera.id.clone(), shown);
+        changes.cameras.insert(camera.id, running);
+        Ok(status)
+    }
+
+    async fn stop(&self, id: &CameraId) -> Result<(), CameraError> {
+        let mut changes = self.changes.lock().await;
+        let Some(camera) = changes.cameras.remove(id) else { return Err(CameraError::NotFound) };
+        self.shown().remove(id);
+        let known = changes.remembered.cameras.len();
+        changes.remembered.cameras.retain(|c| c.id != *id);
+        let saved = if changes.remembered.cameras.len() < known { self.save(&changes) } else { Ok(()) };
+        camera.stop().await;
+        self.metrics.forget_camera(id);
+        saved
+    }
+
+    fn save(&self, changes: &Changes) -> Result<(), CameraError> {
+        match &changes.store {
+            Some(store) => store.save(&changes.remembered).map_err(|e| CameraError::Io(e.to_string())),
+            None => Ok(()),
+        }
+    }
+
+    fn shown(&self) -> MutexGuard<'_, BTreeMap<CameraId, Shown>> {
+        self.shown.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Cameras for CameraSet {
+    fn list(&self) -> Vec<CameraStatus> {
+        self.shown().values().map(status).collect()
+    }
+
+    fn get(&self, id: &CameraId) -> Option<CameraStatus> {
+        self.shown().get(id).map(status)
+    }
+
+    fn add(&self, request: NewCamera) -> BoxFuture<'_, Result<CameraStatus, CameraError>> {
+        self.start(request, true).boxed()
+    }
+
+    fn remove(&self, id: &CameraId) -> BoxFuture<'_, Result<(), CameraError>> {
+        let id = id.clone();
+        async move { self.stop(&id).await }.boxed()
+    }
+
+    fn video(&self, id: &CameraId) -> Option<watch::Receiver<Option<Arc<Picture>>>> {
+        self.shown().get(id).map(|shown| shown.video.clone())
+    }
+}
+
+/// A camera's source as the service plays it: files in real time.
+///
+/// # Errors
+/// The address is wrong; the message never holds a password.
+pub fn source_spec(camera: &NewCamera) -> Result<SourceSpec, SourceError> {
+    let mut spec = SourceSpec::parse(&camera.url)?;
+    spec.transport = match camera.transport {
+        None => Transport::Auto,
+        Some(api::Transport::Tcp) => Transport::Tcp,
+        Some(api::Transport::Udp) => Transport::Udp,
+    };
+    spec.looped = camera.looped;
+    spec.pacing = Pacing::Realtime;
+    Ok(spec)
+}
+
+/// Later than `last`, and than every epoch of a run whose state was lost: seconds since 1970.
+fn next_epoch(last: u64) -> u64 {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
+    now.max(last + 1)
+}
+
+fn status(shown: &Shown) -> CameraStatus {
+    let Shown { url, view, .. } = shown;
+    let condition = view.condition();
+    let metrics = &view.metrics;
+    let [tentative, confirmed, lost] =
+        std::array::from_fn(|i| u64::try_from(metrics.tracks[i].get()).unwrap_or(0));
+    let dropped = DropReason::ALL
+        .into_iter()
+        .map(|reason| (reason.as_str().to_string(), metrics.dropped[reason as usize].get()));
+    CameraStatus {
+        id: view.id.clone(),
+        url: url.clone(),
+        state: match condition.state {
+            CameraState::Connecting => api::CameraState::Connecting,
+            CameraState::Live => api::CameraState::Live,
+            CameraState::Retrying => api::CameraState::Retrying,
+            CameraState::Ended => api::CameraState::Ended,
+            CameraState::Failed => api::CameraState::Failed,
+        },
+        since: Timestamp::try_from(condition.since).unwrap_or(Timestamp::UNIX_EPOCH),
+        last_error_kind: condition.last_failure.as_ref().map(|f| f.label().to_string()),
+        last_error: condition.last_failure.map(|f| f.to_string()),
+        next_retry_s: condition.next_retry.map(|at| at.saturating_duration_since(Instant::now()).as_secs_f64()),
+        reconnects: metrics.reconnects.get(),
+        epoch: view.epoch.0,
+        width: condition.size.map(|s| s.0),
+        height: condition.size.map(|s| s.1),
+        fps: condition.fps,
+        frames_in: metrics.frames_in.get(),
+        tracked: metrics.tracked.get(),
+        dropped: dropped.collect::<BTreeMap<_, _>>(),
+        tracks: TrackCounts { tentative, confirmed, lost },
+    }
+}

@@ -1,0 +1,115 @@
+//! Cameras that were added at run time, remembered across restarts.
+
+use std::fs;
+use std::io::{self, Write};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use crate::api::NewCamera;
+
+/// A file `cameras.json` in the state folder. It holds camera passwords, so only its owner may read it.
+pub struct Store {
+    path: PathBuf,
+}
+
+/// What the file holds.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Remembered {
+    /// The last epoch that was given out: ids of an earlier run are never confused with later ones.
+    pub epoch: u64,
+    /// The cameras, in the order in which they were added.
+    pub cameras: Vec<NewCamera>,
+}
+
+/// The state folder cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum StoreError {
+    /// Reading or writing failed.
+    #[error("cannot {verb} {path}: {source}; give another folder with --state-dir", path = path.display())]
+    Io {
+        /// What was tried.
+        verb: &'static str,
+        /// On what.
+        path: PathBuf,
+        /// What went wrong.
+        source: io::Error,
+    },
+    /// The file is not what was written.
+    #[error("{path} is damaged ({reason}): mend it or move it away; the cameras in it are lost otherwise", path = path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// Where.
+        reason: serde_json::Error,
+    },
+}
+
+impl Store {
+    /// Opens (and makes) the folder and reads what it remembers.
+    ///
+    /// # Errors
+    /// [`StoreError`]; a damaged file is never overwritten.
+    pub fn open(folder: &Path) -> Result<(Self, Remembered), StoreError> {
+        let io = |verb, path: &Path| {
+            let path = path.to_path_buf();
+            move |source| StoreError::Io { verb, path, source }
+        };
+        fs::create_dir_all(folder).map_err(io("make the folder", folder))?;
+        let path = folder.join("cameras.json");
+        let remembered = match fs::read_to_string(&path) {
+            Ok(text) => serde_json::from_str(&text)
+                .map_err(|reason| StoreError::Damaged { path: path.clone(), reason })?,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Remembered::default(),
+            Err(error) => return Err(io("read", &path)(error)),
+        };
+        Ok((Self { path }, remembered))
+    }
+
+    /// Writes everything: to a new file that then takes the old one's place, so that a crash leaves
+    /// either the old or the new.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`].
+    pub fn save(&self, remembered: &Remembered) -> Result<(), StoreError> {
+        let fresh = self.path.with_extension("json.new");
+        let write = || -> io::Result<()> {
+            let mut file =
+                fs::OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(&fresh)?;
+            file.write_all(serde_json::to_string_pretty(remembered)?.as_bytes())?;
+            file.sync_all()?;
+            fs::rename(&fresh, &self.path)?;
+            if let Some(folder) = self.path.parent() {
+                fs::File::open(folder)?.sync_all()?;
+            }
+            Ok(())
+        };
+        write().map_err(|source| StoreError::Io { verb: "write", path: self.path.clone(), source })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::types::CameraId;
+
+    #[test]
+    fn what_is_saved_comes_back_and_damage_is_told() {
+        let folder = tempfile::tempdir().unwrap();
+        let (store, empty) = Store::open(folder.path()).unwrap();
+        assert_eq!(empty, Remembered::default());
+        let camera = NewCamera {
+            id: CameraId::new("gate").unwrap(),
+            url: "rtsp://u:p@h/s".into(),
+            transport: None,
+            looped: false,
+        };
+        let saved = Remembered { epoch: 7, cameras: vec![camera] };
+        store.save(&saved).unwrap();
+        assert_eq!(Store::open(folder.path()).unwrap().1, saved);
+        fs::write(folder.path().join("cameras.json"), "{").unwrap();
+        assert!(matches!(Store::open(folder.path()), Err(StoreError::Damaged { .. })));
+    }
+}

@@ -1,0 +1,175 @@
+//! REST: cameras, problem documents, health, metrics, the page's files.
+
+use std::sync::atomic::Ordering;
+
+use serde_json::json;
+
+use super::support::*;
+
+#[tokio::test]
+async fn a_camera_is_added_shown_and_deleted() {
+    let server = Server::start().await;
+    assert_eq!(server.get("/v1/cameras").await.json(), json!({"cameras": []}));
+
+    let added = server.post("/v1/cameras", r#"{"id":"gate","url":"rtsp://host/x","transport":"tcp"}"#).await;
+    assert_eq!(added.status, 201);
+    assert!(added.head.contains("location: /v1/cameras/gate"), "{}", added.head);
+    let expected = json!({
+        "id": "gate", "url": "rtsp://host/x", "state": "live", "since": "2026-01-02T03:04:05.678Z",
+        "last_error": null, "last_error_kind": null, "next_retry_s": null, "reconnects": 0, "epoch": 1,
+        "width": 320, "height": 240, "fps": 25.0, "frames_in": 10, "tracked": 8, "dropped": {"stale": 2},
+        "tracks": {"tentative": 0, "confirmed": 1, "lost": 0},
+    });
+    assert_eq!(added.json(), expected);
+    assert_eq!(server.get("/v1/cameras/gate").await.json(), expected);
+    assert_eq!(server.get("/v1/cameras").await.json(), json!({"cameras": [expected]}));
+
+    let deleted = server.request("DELETE", "/v1/cameras/gate", &[], b"").await;
+    assert_eq!((deleted.status, deleted.text()), (204, ""));
+    assert_eq!(server.get("/v1/cameras/gate").await.status, 404);
+    server.stop().await;
+}
+
+/// Every error is a problem document with a kind for programs and a detail that names what was wrong.
+#[tokio::test]
+async fn errors_are_problem_documents() {
+    let server = Server::start().await;
+    server.cameras.put("gate", "rtsp://host/x");
+    let json_type: &[(&str, &str)] = &[("Content-Type", "application/json")];
+    let good = r#"{"id":"b","url":"rtsp://host/x"}"#;
+    let too_large = format!(r#"{{"id":"b","url":"{}"}}"#, "x".repeat(65 * 1024));
+    for (method, path, headers, body, status, kind, detail) in [
+        ("GET", "/v1/cameras/nope", json_type, "", 404, "unknown-camera", "\"nope\""),
+        ("GET", "/v1/cameras/%3Cb%3E", json_type, "", 404, "unknown-camera", "<b>"),
+        ("DELETE", "/v1/cameras/nope", json_type, "", 404, "unknown-camera", "\"nope\""),
+        ("GET", "/v1/cameras/nope/snapshot.jpg", json_type, "", 404, "unknown-camera", "\"nope\""),
+        ("GET", "/v1/cameras/nope/stream.mjpeg", json_type, "", 404, "unknown-camera", "\"nope\""),
+        ("GET", "/v1/cameras/gate/snapshot.jpg", json_type, "", 503, "unavailable", "no picture yet"),
+        ("GET", "/v1/cameras/gate/snapshot.jpg?annotate=1", json_type, "", 400, "bad-request", "annotate"),
+        ("GET", "/v1/cameras/gate/stream.mjpeg?x=1", json_type, "", 400, "bad-request", "\"x\""),
+        ("GET", "/v1/tracks", json_type, "", 426, "websocket-only", "WebSocket"),
+        ("GET", "/nowhere", json_type, "", 404, "not-found", "/nowhere"),
+        ("PUT", "/v1/cameras", json_type, "", 405, "method-not-allowed", "PUT"),
+        (
+            "POST",
+            "/v1/cameras",
+            json_type,
+            r#"{"id":"gate","url":"rtsp://h"}"#,
+            409,
+            "camera-exists",
+            "delete it",
+        ),
+        ("POST", "/v1/cameras", json_type, r#"{"id":"b","url":"nonsense"}"#, 400, "bad-request", "nonsense"),
+        ("POST", "/v1/cameras", json_type, r#"{"id":"b c","url":"rtsp://h"}"#, 400, "bad-request", "\"b c\""),
+        ("POST", "/v1/cameras", json_type, r#"{"id":"b"}"#, 400, "bad-request", "`url`"),
+        (
+            "POST",
+            "/v1/cameras",
+            json_type,
+            r#"{"id":"b","url":"x://y","uri":1}"#,
+            400,
+            "bad-request",
+            "`uri`",
+        ),
+        (
+            "POST",
+            "/v1/cameras",
+            json_type,
+            r#"{"id":"b","url":"x://y","transport":"x"}"#,
+            400,
+            "bad-request",
+            "`x`",
+        ),
+        ("POST", "/v1/cameras", json_type, r#"{"id":"#, 400, "bad-request", "column"),
+        ("POST", "/v1/cameras", json_type, "", 400, "bad-request", "EOF"),
+        ("POST", "/v1/cameras", &[], good, 415, "media-type", "application/json"),
+        (
+            "POST",
+            "/v1/cameras",
+            &[("Content-Type", "text/plain")],
+            good,
+            415,
+            "media-type",
+            "application/json",
+        ),
+        ("POST", "/v1/cameras", json_type, &too_large, 413, "too-large", "65536"),
+    ] {
+        let case = format!("{method} {path} {}", body.chars().take(60).collect::<String>());
+        let answer = server.request(method, path, headers, body.as_bytes()).await;
+        assert_eq!(answer.status, status, "{case}: {}", answer.text());
+        assert!(answer.head.contains("content-type: application/problem+json"), "{case}: {}", answer.head);
+        let problem = answer.json();
+        assert_eq!(problem["type"], format!("urn:gakp:problem:{kind}"), "{case}");
+        assert_eq!(problem["status"], status, "{case}");
+        assert!(!problem["title"].as_str().unwrap().is_empty(), "{case}");
+        assert!(problem["detail"].as_str().unwrap().contains(detail), "{case}: {problem}");
+    }
+    assert_eq!(server.get("/v1/cameras").await.json()["cameras"].as_array().unwrap().len(), 1);
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn the_limit_of_cameras_is_a_conflict() {
+    let server = Server::start().await;
+    for i in 0..=LIMIT {
+        let answer = server.post("/v1/cameras", &format!(r#"{{"id":"c{i}","url":"rtsp://h/{i}"}}"#)).await;
+        if i < LIMIT {
+            assert_eq!(answer.status, 201);
+        } else {
+            assert_eq!(answer.status, 409);
+            assert_eq!(answer.json()["type"], "urn:gakp:problem:camera-limit");
+        }
+    }
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn health_readiness_and_metrics() {
+    let server = Server::start().await;
+    assert_eq!(server.get("/healthz").await.json(), json!({"status": "ok"}));
+    assert_eq!(server.get("/readyz").await.json(), json!({"status": "ready"}));
+    server.ready.store(false, Ordering::SeqCst);
+    let answer = server.get("/readyz").await;
+    assert_eq!(answer.status, 503);
+    assert_eq!(answer.json(), json!({"status": "not ready", "reasons": ["the detector is not loaded"]}));
+    assert_eq!(server.get("/healthz").await.status, 200, "not ready is not dead");
+
+    let subscriber = server.socket("/v1/tracks", &[]).await.ok().unwrap();
+    let metrics = server.get("/metrics").await;
+    assert!(metrics.head.contains("content-type: text/plain; version=0.0.4"), "{}", metrics.head);
+    assert!(metrics.text().contains("\ngakp_hub_subscribers 1\n"), "{}", metrics.text());
+    drop(subscriber);
+    let hub = server.hub.clone();
+    eventually("the subscriber to be gone", || hub.metrics().subscribers.get() == 0).await;
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn the_page_and_its_files_come_with_a_policy() {
+    let server = Server::start().await;
+    let page = server.get("/").await;
+    assert!(page.head.contains("content-type: text/html; charset=utf-8"), "{}", page.head);
+    assert!(page.head.contains("content-security-policy: default-src 'none'"), "{}", page.head);
+    // What the page and its modules name is there, and is all from here.
+    let names = ["style.css", "app.js", "view.js", "draw.js"];
+    for name in names {
+        let file = server.get(&format!("/page/{name}")).await;
+        assert_eq!(file.status, 200, "{name}");
+        assert!(!file.text().contains("http://") && !file.text().contains("https://"), "{name} is from here");
+        assert!(!file.text().contains("innerHTML"), "{name} writes text, not markup");
+    }
+    assert!(!page.text().contains("http"), "nothing from elsewhere");
+    server.stop().await;
+}
+
+/// Someone who says nothing holds up nobody, nor the end.
+#[tokio::test]
+async fn it_stops_in_time_whoever_is_connected() {
+    let server = Server::start().await;
+    let _silent = tokio::net::TcpStream::connect(server.addr).await.unwrap();
+    let mut socket = server.socket("/v1/tracks", &[]).await.ok().unwrap();
+    let code = tokio::spawn(async move { socket.closed().await });
+    let took = server.stop().await;
+    assert_eq!(code.await.unwrap(), 1001);
+    assert!(took.as_secs_f64() < 2.0, "{took:?}");
+}

@@ -1,0 +1,11 @@
+//! The HTTP and WebSocket edge, against a real server in this process with cameras that are made up.
+#![cfg(feature = "service")]
+
+#[path = "api/rest.rs"]
+mod rest;
+#[path = "api/support.rs"]
+mod support;
+#[path = "api/tracks.rs"]
+mod tracks;
+#[path = "api/video.rs"]
+mod video;

@@ -1,0 +1,137 @@
+//! `gakp eval` as a user runs it.
+#![cfg(feature = "cli")]
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+fn fixtures() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/mot/classes")
+}
+
+fn eval(gt: &Path, results: &Path, more: &[&str]) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_gakp"));
+    command.arg("eval").arg("--gt").arg(gt).arg("--results").arg(results).args(more).output().unwrap()
+}
+
+fn stdout(output: &Output) -> String {
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout.clone()).unwrap()
+}
+
+/// A copy of the fixtures that a test may break: (folder, truth, results).
+fn copy() -> (tempfile::TempDir, PathBuf, PathBuf) {
+    let folder = tempfile::tempdir().unwrap();
+    let (gt, results) = (folder.path().join("gt"), folder.path().join("results"));
+    std::fs::create_dir_all(&results).unwrap();
+    for name in ["SEQ-01", "SEQ-02"] {
+        std::fs::create_dir_all(gt.join(name).join("gt")).unwrap();
+        for file in ["gt/gt.txt", "seqinfo.ini"] {
+            std::fs::copy(fixtures().join("gt").join(name).join(file), gt.join(name).join(file)).unwrap();
+        }
+        let file = format!("{name}.txt");
+        std::fs::copy(fixtures().join("results").join(&file), results.join(&file)).unwrap();
+    }
+    (folder, gt, results)
+}
+
+#[test]
+fn json_holds_what_trackeval_says() {
+    let output = eval(&fixtures().join("gt"), &fixtures().join("results"), &["--json"]);
+    let report: Value = serde_json::from_str(&stdout(&output)).unwrap();
+    let expected = std::fs::read_to_string(fixtures().join("expected.json")).unwrap();
+    let expected: Value = serde_json::from_str(&expected).unwrap();
+    let compare = |ours: &Value, theirs: &Value| {
+        let (ours, theirs) = (ours.as_object().unwrap(), theirs.as_object().unwrap());
+        assert!(ours.keys().eq(theirs.keys()), "{ours:?} {theirs:?}");
+        for (key, expected) in theirs {
+            match (ours[key].as_f64(), expected.as_f64()) {
+                (Some(a), Some(b)) => assert!((a - b).abs() < 0.5e-4, "{key} is {a}, expected {b}"),
+                _ => assert_eq!(&ours[key], expected),
+            }
+        }
+    };
+    compare(&report["combined"], &expected["combined"]);
+    let (ours, theirs) = (report["sequences"].as_array().unwrap(), expected["sequences"].as_array().unwrap());
+    assert_eq!(ours.len(), theirs.len());
+    ours.iter().zip(theirs).for_each(|(a, b)| compare(a, b));
+}
+
+#[test]
+fn table_has_a_line_a_sequence_and_all_of_them() {
+    let (_folder, gt, results) = copy();
+    let table = stdout(&eval(&gt, &results, &[]));
+    let names: Vec<&str> = table.lines().skip(1).filter_map(|line| line.split_whitespace().next()).collect();
+    assert_eq!(names, ["SEQ-01", "SEQ-02", "COMBINED"]);
+    let titles: Vec<&str> = table.lines().next().unwrap().split_whitespace().collect();
+    assert_eq!(titles, ["HOTA", "DetA", "AssA", "MOTA", "IDF1", "MT", "ML", "FP", "FN", "IDs", "Frag"]);
+    assert_eq!(stdout(&eval(&gt, &results, &["--det", "02"])).lines().count(), 3);
+    // Results in a folder `data` are found as well.
+    std::fs::create_dir(results.join("data")).unwrap();
+    std::fs::rename(results.join("SEQ-01.txt"), results.join("data/SEQ-01.txt")).unwrap();
+    assert_eq!(stdout(&eval(&gt, &results, &[])), table);
+}
+
+#[test]
+fn second_half_is_the_frames_after_the_middle() {
+    let (_folder, gt, results) = copy();
+    // 30 frames: 17 to 30 are scored, and numbered 1 to 14 in the results.
+    for name in ["SEQ-01", "SEQ-02"] {
+        let truth = std::fs::read_to_string(gt.join(name).join("gt/gt.txt")).unwrap();
+        let rows = gakp::mot::second_half(&gakp::mot::parse_truth(&truth, None).unwrap(), 30);
+        let pedestrians: Vec<_> =
+            rows.into_iter().filter(|row| row.class == Some(1) && row.conf == 1.0).collect();
+        assert!(pedestrians.iter().all(|row| (1..=14).contains(&row.frame)));
+        std::fs::write(results.join(format!("{name}.txt")), gakp::mot::write_results(&pedestrians)).unwrap();
+    }
+    let report: Value =
+        serde_json::from_str(&stdout(&eval(&gt, &results, &["--second-half", "--json"]))).unwrap();
+    assert_eq!(report["sequences"][0]["frames"], 14);
+    assert_eq!((&report["combined"]["FN"], &report["combined"]["FP"]), (&0.into(), &0.into()));
+}
+
+#[test]
+fn mistakes_end_with_one_message_and_code_2() {
+    type Break = fn(&Path, &Path);
+    let cases: [(Break, &str); 7] = [
+        (
+            |_, results| std::fs::remove_file(results.join("SEQ-02.txt")).unwrap(),
+            "no results for sequence SEQ-02",
+        ),
+        (
+            |_, results| {
+                std::fs::write(results.join("SEQ-02.txt"), "1,1,1,1,1,1,1\n1,1,1,1,nan,1,1\n").unwrap()
+            },
+            "SEQ-02.txt: line 2: column 5 (w) is \"nan\", expected",
+        ),
+        (
+            |_, results| std::fs::write(results.join("SEQ-01.txt"), "31,1,1,1,1,1,1\n").unwrap(),
+            "SEQ-01.txt: line 1: frame 31 is past the end of the sequence, which has 30 frames",
+        ),
+        (
+            |gt, _| std::fs::write(gt.join("SEQ-01/gt/gt.txt"), "1,1,1,1,1,1\n").unwrap(),
+            "gt.txt: line 1: 6 columns",
+        ),
+        (|gt, _| std::fs::remove_file(gt.join("SEQ-01/seqinfo.ini")).unwrap(), "cannot read"),
+        (
+            |gt, _| std::fs::write(gt.join("SEQ-01/seqinfo.ini"), "[Sequence]\nframeRate=3\n").unwrap(),
+            "seqinfo.ini: name is missing from section [Sequence]",
+        ),
+        (|gt, _| std::fs::remove_dir_all(gt).unwrap(), "cannot read folder"),
+    ];
+    for (broken, expected) in cases {
+        let (_folder, gt, results) = copy();
+        broken(&gt, &results);
+        let output = eval(&gt, &results, &[]);
+        let message = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{message}");
+        assert!(message.contains(expected), "{message:?} lacks {expected:?}");
+        assert_eq!(message.trim_end().lines().count(), 1, "{message}");
+        assert!(output.stdout.is_empty(), "nothing is printed before all is scored");
+    }
+    let (_folder, gt, results) = copy();
+    let output = eval(&gt, &results, &["--det", "SDP"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("expected folders SEQ-SDP/ with gt/gt.txt"));
+}
