@@ -104,24 +104,24 @@ fn colours_tell_people_apart() {
     let (Some(models), Some((frames, truth))) = (models(), stadtmitte()) else { return };
     let mut settings = settings(&models);
     for name in std::env::var("REID").unwrap_or("builtin".into()).split(',') {
-    settings.reid = name.into();
-    let models = Models::load(&settings, Arc::new(())).expect("models");
-    let embedder = models.embedder.expect("an embedder");
-    let start = std::time::Instant::now();
-    let mut crops = vec![];
-    let mut n = 0;
-    for (index, (frame, truth)) in frames.iter().zip(&truth).enumerate().step_by(4) {
-        let boxes: Vec<BBox> = truth.iter().map(|(_, bbox)| *bbox).collect();
-        n += boxes.len();
-        let found = embedder.embed_blocking(frame.clone(), boxes).expect("embeddings");
-        for ((id, _), embedding) in truth.iter().zip(found) {
-            crops.extend(embedding.map(|e| (index, *id, e)));
+        settings.reid = name.into();
+        let models = Models::load(&settings, Arc::new(())).expect("models");
+        let embedder = models.embedder.expect("an embedder");
+        let start = std::time::Instant::now();
+        let mut crops = vec![];
+        let mut n = 0;
+        for (index, (frame, truth)) in frames.iter().zip(&truth).enumerate().step_by(4) {
+            let boxes: Vec<BBox> = truth.iter().map(|(_, bbox)| *bbox).collect();
+            n += boxes.len();
+            let found = embedder.embed_blocking(frame.clone(), boxes).expect("embeddings");
+            for ((id, _), embedding) in truth.iter().zip(found) {
+                crops.extend(embedding.map(|e| (index, *id, e)));
+            }
         }
-    }
-    println!("{name} {n} crops {:?} each", start.elapsed() / n as u32);
-    for gap in [1, 25, 40, 50] {
-        let (map, rank1) = retrieval(&crops, gap);
-        println!("gap {gap}: mAP {map:.4}, rank-1 {rank1:.4}, {} crops", crops.len());
-    }
+        println!("{name} {n} crops {:?} each", start.elapsed() / n as u32);
+        for gap in [1, 25, 40, 50] {
+            let (map, rank1) = retrieval(&crops, gap);
+            println!("gap {gap}: mAP {map:.4}, rank-1 {rank1:.4}, {} crops", crops.len());
+        }
     }
 }

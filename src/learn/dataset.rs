@@ -104,32 +104,36 @@ pub fn group(name: &str) -> &str {
     }
 }
 
-/// Loads every sequence under `root` (or `root` itself, when it is one), in the order of the names.
+/// The folders of the sequences under `root` (or `root` itself, when it is one), in the order of
+/// their names.
 ///
 /// # Errors
-/// What cannot be read or is wrong, by file; a root without sequences.
-pub fn load(root: &Path) -> Result<Vec<LabelledSequence>, DatasetError> {
+/// A root that cannot be read or holds no sequence.
+pub fn folders(root: &Path) -> Result<Vec<PathBuf>, DatasetError> {
     let is_sequence = |path: &Path| path.join("gt/gt.txt").is_file() && path.join("det/det.txt").is_file();
-    let mut folders = vec![];
     if is_sequence(root) {
-        folders.push(root.to_path_buf());
-    } else {
-        let wrong = |source| DatasetError::Read { path: root.to_path_buf(), source };
-        for entry in fs::read_dir(root).map_err(wrong)? {
-            let path = entry.map_err(wrong)?.path();
-            if is_sequence(&path) {
-                folders.push(path);
-            }
+        return Ok(vec![root.to_path_buf()]);
+    }
+    let wrong = |source| DatasetError::Read { path: root.to_path_buf(), source };
+    let mut found = vec![];
+    for entry in fs::read_dir(root).map_err(wrong)? {
+        let path = entry.map_err(wrong)?.path();
+        if is_sequence(&path) {
+            found.push(path);
         }
     }
-    if folders.is_empty() {
+    if found.is_empty() {
         return Err(DatasetError::Empty(root.to_path_buf()));
     }
-    folders.sort();
-    folders.iter().map(|folder| load_sequence(folder)).collect()
+    found.sort();
+    Ok(found)
 }
 
-fn load_sequence(folder: &Path) -> Result<LabelledSequence, DatasetError> {
+/// Loads the sequence in `folder` and joins its detections to its truth.
+///
+/// # Errors
+/// A file that cannot be read or is wrong; the message names it.
+pub fn load(folder: &Path) -> Result<LabelledSequence, DatasetError> {
     let read = |file: &str| {
         let path = folder.join(file);
         fs::read_to_string(&path).map_err(|source| DatasetError::Read { path, source })

@@ -63,6 +63,33 @@ impl Examples {
         self.weights.extend_from_slice(&other.weights);
     }
 
+    /// A random choice of `count` examples, in their order; all of them when there are fewer.
+    pub fn choose(&self, count: usize, rng: &mut fastrand::Rng) -> Examples {
+        let mut chosen = Examples::default();
+        let mut moved: Vec<Option<u32>> = vec![None; self.lengths.len()];
+        let mut wanted = count.min(self.len());
+        for i in 0..self.len() {
+            // Knuth's selection sampling: the share still wanted of those still to come.
+            if rng.usize(..self.len() - i) >= wanted {
+                continue;
+            }
+            wanted -= 1;
+            let track = self.track[i] as usize;
+            let to = *moved[track].get_or_insert_with(|| {
+                let width = HISTORY * STEP_FEATURES;
+                let rows = &self.histories[track * width..(track + 1) * width];
+                chosen.histories.extend_from_slice(rows);
+                chosen.lengths.push(self.lengths[track]);
+                (chosen.lengths.len() - 1) as u32
+            });
+            chosen.track.push(to);
+            chosen.candidates.extend_from_slice(self.sequence(i as u32).1);
+            chosen.labels.push(self.labels[i]);
+            chosen.weights.push(self.weights[i]);
+        }
+        chosen
+    }
+
     /// History rows `[length, STEP_FEATURES]` and candidate `[CANDIDATE_FEATURES]` of example `i`.
     pub fn sequence(&self, i: u32) -> (&[f32], &[f32]) {
         let (i, track) = (i as usize, self.track[i as usize] as usize);

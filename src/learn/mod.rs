@@ -9,6 +9,7 @@
 
 mod activate;
 mod adam;
+pub mod card;
 pub mod dataset;
 mod examples;
 mod fit;
@@ -18,6 +19,7 @@ pub mod literal;
 pub mod metrics;
 mod model;
 pub mod onnx;
+mod recipe;
 mod scorer;
 mod teacher;
 
@@ -26,5 +28,6 @@ pub use examples::Examples;
 pub use fit::{Fit, Progress, fit, logits};
 pub use gru::{Batch, Gru, GruShape, Tape};
 pub use model::{LinkModel, Normaliser};
+pub use recipe::Recipe;
 pub use scorer::GruScorer;
 pub use teacher::Teacher;

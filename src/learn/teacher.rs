@@ -19,8 +19,6 @@ pub struct Teacher {
     pub burst_chance: f64,
     /// Longest time that it loses them, s; short times are likelier (the time is this times `U^2`).
     pub burst_longest: f64,
-    /// Share of all pairs that is kept, before the choice by kind.
-    pub share: f64,
     /// Share of easy positives that is kept: well overlapped, seen in the frame before.
     pub keep_easy: f64,
     /// Share of far negatives that is kept: outside the tracker's own gate.
@@ -44,7 +42,6 @@ impl Default for Teacher {
         Self {
             burst_chance: 0.03,
             burst_longest: 1.5,
-            share: 1.0,
             keep_easy: 0.12,
             keep_far: 0.3,
             max_weight: 9.0,
@@ -113,7 +110,7 @@ impl Teacher {
                     false if pair.geometry.mahalanobis2 > inner_gate => self.keep_far,
                     _ => 1.0,
                 };
-                (rng.f64() < keep * self.share).then(|| (label, (1.0 / keep).min(self.max_weight).sqrt() as f32))
+                (rng.f64() < keep).then(|| (label, (1.0 / keep).min(self.max_weight).sqrt() as f32))
             });
 
             let seconds = frame.time.since(Default::default());
