@@ -34,8 +34,11 @@ pub fn track(input: &str, job: &Job, out: &mut Output) -> Result<Tracked> {
     spec.check()?;
     let metrics = Metrics::new()?;
     let models = Models::load(&job.models, metrics.clone())?;
-    let runtime =
-        tokio::runtime::Builder::new_multi_thread().thread_name("async").worker_threads(1).enable_all().build()?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .thread_name("async")
+        .worker_threads(1)
+        .enable_all()
+        .build()?;
     let tracked = runtime.block_on(run(spec, models, metrics, job, out));
     out.finish()?;
     tracked
@@ -61,7 +64,8 @@ async fn run(
         policy: if live { Policy::NewestWins } else { Policy::Wait },
     };
     let camera = Camera::start(&lanes, plan).await?;
-    let short = Path::new(&name).file_name().map_or_else(|| name.clone(), |n| n.to_string_lossy().into_owned());
+    let short =
+        Path::new(&name).file_name().map_or_else(|| name.clone(), |n| n.to_string_lossy().into_owned());
     let bar = progress::frames(job.frames, &short);
     let mut film = job.video.as_deref().map(Film::new);
     let (mut frames, start) = (0u64, Instant::now());
@@ -73,9 +77,10 @@ async fn run(
         };
         let Some(picture) = picture else { break };
         let condition = camera.view().condition();
-        if let (Some(length), Some(fps)) =
-            (condition.opened.as_ref().and_then(|o| o.duration), condition.opened.as_ref().and_then(|o| o.fps))
-        {
+        if let (Some(length), Some(fps)) = (
+            condition.opened.as_ref().and_then(|o| o.duration),
+            condition.opened.as_ref().and_then(|o| o.fps),
+        ) {
             bar.set_length((length.as_secs_f64() * fps).round() as u64);
         }
         frames += 1;
