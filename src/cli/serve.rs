@@ -122,9 +122,9 @@ async fn serve(plan: Plan) -> Result<()> {
     let (settings, observer) = (plan.models, metrics.clone());
     let models = tokio::task::spawn_blocking(move || Models::load(&settings, observer)).await??;
     metrics.provider(models.report.provider);
-    let listener = TcpListener::bind(plan.listen).await.with_context(|| {
-        format!("cannot listen on {}: choose another address with --listen", plan.listen)
-    })?;
+    let listener = TcpListener::bind(plan.listen)
+        .await
+        .with_context(|| format!("cannot listen on {}: choose another address with --listen", plan.listen))?;
     let address = listener.local_addr()?;
     let hub = Hub::new(HubConfig::default(), models.detector.classes().into());
     hub.metrics().register(metrics.registry())?;

@@ -4,6 +4,8 @@ mod progress;
 mod sequence;
 mod video;
 
+pub(super) use video::track as track_video;
+
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
@@ -44,12 +46,12 @@ pub struct Args {
 }
 
 /// What every kind of input needs.
-struct Job {
-    tracker: TrackerConfig,
-    models: ModelSettings,
-    frames: Option<u64>,
-    second_half: bool,
-    video: Option<PathBuf>,
+pub(super) struct Job {
+    pub tracker: TrackerConfig,
+    pub models: ModelSettings,
+    pub frames: Option<u64>,
+    pub second_half: bool,
+    pub video: Option<PathBuf>,
 }
 
 /// Runs the command.
@@ -78,7 +80,7 @@ pub fn run(args: Args) -> Result<()> {
                 bail!("--second-half is for MOTChallenge sequence folders");
             }
             let mut out = Output::create(&args.out)?;
-            video::track(input, &job, &mut out)
+            video::track(input, &job, &mut out).map(|_| ())
         }
         [folder] => {
             let mut out = Output::create(&args.out)?;
@@ -94,13 +96,13 @@ pub fn run(args: Args) -> Result<()> {
 }
 
 /// Where rows go.
-struct Output {
+pub(super) struct Output {
     name: String,
     file: Box<dyn Write>,
 }
 
 impl Output {
-    fn create(path: &Path) -> Result<Self> {
+    pub fn create(path: &Path) -> Result<Self> {
         let name = path.display().to_string();
         if name == "-" {
             return Ok(Self { name: "standard output".into(), file: Box::new(std::io::stdout().lock()) });
