@@ -189,7 +189,7 @@ impl DetectModel {
 
 /// A candidate in the frame; a box without an area is none.
 fn detection(letterbox: &Letterbox, candidate: &Candidate) -> Option<Detection> {
-    let bbox = letterbox.to_frame(candidate.corners);
+    let bbox = letterbox.frame_box(candidate.corners);
     let score = f64::from(candidate.score).min(1.0);
     bbox.is_valid().then_some(Detection { bbox, score, class: ClassId(candidate.class) })
 }

@@ -139,7 +139,8 @@ impl Instance {
         let reid = match &plan.reid {
             Reid::None => None,
             Reid::Stripes => Some(EmbedModel::Stripes(Box::default())),
-            Reid::Network(Chosen { entry, file }) => {
+            Reid::Network(network) => {
+                let Chosen { entry, file } = &**network;
                 let arrangement = runtime.provider.arrangement(Task::Reid, settings.threads);
                 let mut network = NetworkModel::load(runtime, entry, file, arrangement)?;
                 network.warm_up()?;

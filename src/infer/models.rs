@@ -113,7 +113,8 @@ impl Models {
                 let arrangement = arrange(Task::Reid, "builtin", Provider::Cpu);
                 Some(Embedder::start_stripes(arrangement, observer.clone())?)
             }
-            Reid::Network(Chosen { entry, file }) => {
+            Reid::Network(network) => {
+                let Chosen { entry, file } = &**network;
                 let arrangement = arrange(Task::Reid, &entry.name, runtime.provider);
                 Some(Embedder::start_network(runtime, entry, file, arrangement, observer.clone())?)
             }
@@ -159,7 +160,7 @@ pub(super) struct Chosen {
 pub(super) enum Reid {
     None,
     Stripes,
-    Network(Chosen),
+    Network(Box<Chosen>),
 }
 
 impl Plan {
@@ -170,7 +171,7 @@ impl Plan {
         let reid = match settings.reid.as_str() {
             "none" => Reid::None,
             "builtin" => Reid::Stripes,
-            name => Reid::Network(choose(&manifest, Task::Reid, name)?),
+            name => Reid::Network(Box::new(choose(&manifest, Task::Reid, name)?)),
         };
         let link = match settings.link.as_str() {
             "none" => None,
