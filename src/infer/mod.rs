@@ -11,6 +11,8 @@ mod models;
 mod picture;
 mod runtime;
 mod scale;
+#[cfg(test)]
+pub(crate) mod testing;
 
 pub use batcher::{Arrangement, BatchModel, BatchStats, Batcher, Observer};
 pub use error::InferError;
