@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use super::models::ModelArgs;
 use super::track::{Job, Output, track_video};
-use crate::config::ModelConfig;
+use crate::config::{ModelConfig, TrackerOptions};
 use crate::infer::bench::{AloneReport, FrameWork, models_alone};
 use crate::infer::{ModelSettings, Models};
 use crate::ingest::{self, Pacing, SourceEvent, SourceSpec};
@@ -98,7 +98,7 @@ fn pipeline(args: PipelineArgs) -> Result<()> {
     let frames = decode(&args.video)?;
     let work = frame_work(&frames, &settings)?;
     let job = Job {
-        tracker: TrackerConfig::default(),
+        tracker: TrackerOptions::default(),
         models: settings.clone(),
         frames: None,
         second_half: false,
@@ -161,7 +161,7 @@ fn decode(video: &str) -> Result<Vec<(Image, MediaTime)>> {
 fn frame_work(frames: &[(Image, MediaTime)], settings: &ModelSettings) -> Result<Vec<FrameWork>> {
     let models = Models::load(settings, Arc::new(()))?;
     let linker = models.linker.clone().context("tracking needs a link scorer: set --link to one")?;
-    let mut tracker = Tracker::new(TrackerConfig::default());
+    let mut tracker = Tracker::new(models.calibrate(TrackerConfig::default()));
     let mut request = LinkRequest::default();
     let mut work = Vec::with_capacity(frames.len());
     for (image, time) in frames {
@@ -179,8 +179,7 @@ fn frame_work(frames: &[(Image, MediaTime)], settings: &ModelSettings) -> Result
             embeddings: &embeddings,
         };
         tracker.predict(input, &mut request);
-        let links =
-            if request.is_empty() { Vec::new() } else { linker.score_blocking(request.clone())? };
+        let links = if request.is_empty() { Vec::new() } else { linker.score_blocking(request.clone())? };
         tracker.update(&links)?;
         work.push(FrameWork { image: image.clone(), boxes, link: request.clone() });
     }
@@ -244,7 +243,10 @@ fn print(report: &Report) {
     let row = |name: &str, [median, least, most]: [f64; 3], unit: &str| {
         println!("{name:<28} {median:8.2} {unit:<9} ({least:.2} to {most:.2})");
     };
-    println!("{}: {} frames, {} rounds, {} threads", report.video, report.frames, report.rounds, report.threads);
+    println!(
+        "{}: {} frames, {} rounds, {} threads",
+        report.video, report.frames, report.rounds, report.threads
+    );
     row("whole offline run", report.whole_fps, "frames/s");
     row("models alone", report.models_fps, "frames/s");
     row("whole / models", report.ratio, "");

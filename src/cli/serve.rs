@@ -11,7 +11,7 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use super::models::ModelArgs;
 use crate::api::{self, ApiConfig, NewCamera};
-use crate::config::Config;
+use crate::config::{Config, TrackerOptions};
 use crate::infer::Models;
 use crate::pipeline::{CameraSet, Lanes, MAX_CAMERAS, SetConfig, Store, source_spec};
 use crate::publish::{Hub, HubConfig};
@@ -75,7 +75,7 @@ struct Plan {
     cameras: Vec<NewCamera>,
     store: (Store, crate::pipeline::Remembered),
     limit: usize,
-    tracker: TrackerConfig,
+    tracker: TrackerOptions,
     models: crate::infer::ModelSettings,
 }
 
@@ -109,7 +109,7 @@ impl Plan {
             cameras,
             store: Store::open(&state_dir)?,
             limit,
-            tracker: config.tracker.apply(TrackerConfig::default())?,
+            tracker: config.tracker,
             models: crate::config::ModelConfig::from(args.models).or(config.models).settings()?,
         })
     }
@@ -122,6 +122,7 @@ async fn serve(plan: Plan) -> Result<()> {
     let (settings, observer) = (plan.models, metrics.clone());
     let models = tokio::task::spawn_blocking(move || Models::load(&settings, observer)).await??;
     metrics.provider(models.report.provider);
+    let tracker = plan.tracker.apply(models.calibrate(TrackerConfig::default()))?;
     let listener = TcpListener::bind(plan.listen)
         .await
         .with_context(|| format!("cannot listen on {}: choose another address with --listen", plan.listen))?;
@@ -132,7 +133,7 @@ async fn serve(plan: Plan) -> Result<()> {
         lanes: Lanes::start(models, metrics.clone())?,
         hub: hub.clone(),
         metrics: metrics.clone(),
-        tracker: plan.tracker,
+        tracker,
         store: Some(plan.store),
         limit: plan.limit,
     });

@@ -6,8 +6,16 @@
 //! centre line count more: the person is there, the background beside. The square root of the bins
 //! (Hellinger's kernel) makes their cosine a similarity of distributions.
 
-use crate::infer::yuv_to_rgb;
+use crate::infer::{Calibration, yuv_to_rgb};
 use crate::types::{BBox, Embedding, Image};
+
+/// How the tracker reads the cosine of two such vectors (docs/method.md has the figures).
+pub const CALIBRATION: Calibration = Calibration {
+    high_score: None,
+    birth_score: None,
+    appearance_weight: Some(10.0),
+    appearance_pivot: Some(0.75),
+};
 
 /// Stripes from top to bottom.
 pub const STRIPES: usize = 6;

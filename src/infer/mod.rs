@@ -17,7 +17,9 @@ pub(crate) mod testing;
 pub use batcher::{Arrangement, BatchModel, BatchStats, Batcher, Observer};
 pub use error::InferError;
 pub use linker::Linker;
-pub use manifest::{ColourOrder, Dim, Family, Fit, InputSpec, Manifest, ModelEntry, OutputSpec, Task};
+pub use manifest::{
+    Calibration, ColourOrder, Dim, Family, Fit, InputSpec, Manifest, ModelEntry, OutputSpec, Task,
+};
 pub use models::{ModelSettings, Models, Report};
 pub use runtime::{Provider, ProviderChoice, Runtime};
 

@@ -12,9 +12,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 
 use super::models::ModelArgs;
-use crate::config::{Config, ModelConfig};
+use crate::config::{Config, ModelConfig, TrackerOptions};
 use crate::infer::ModelSettings;
-use crate::track::TrackerConfig;
 
 /// Tracks a video, a URL or a MOTChallenge sequence, and writes MOTChallenge rows.
 ///
@@ -47,7 +46,7 @@ pub struct Args {
 
 /// What every kind of input needs.
 pub(super) struct Job {
-    pub tracker: TrackerConfig,
+    pub tracker: TrackerOptions,
     pub models: ModelSettings,
     pub frames: Option<u64>,
     pub second_half: bool,
@@ -61,7 +60,7 @@ pub(super) struct Job {
 pub fn run(args: Args) -> Result<()> {
     let config = args.config.as_deref().map(Config::read).transpose()?.unwrap_or_default();
     let job = Job {
-        tracker: config.tracker.apply(TrackerConfig::default())?,
+        tracker: config.tracker,
         models: ModelConfig::from(args.models).or(config.models).settings()?,
         frames: args.frames,
         second_half: args.second_half,

@@ -14,6 +14,7 @@ use crate::mot::report_rows;
 use crate::pipeline::{Camera, CameraPlan, CameraState, Collector, Lanes, Policy};
 use crate::publish::{Rgb, RgbConverter, Trails, annotate};
 use crate::telemetry::Metrics;
+use crate::track::TrackerConfig;
 use crate::types::{CameraId, Epoch};
 
 /// Tracked frames that may wait to be written.
@@ -34,12 +35,13 @@ pub fn track(input: &str, job: &Job, out: &mut Output) -> Result<Tracked> {
     spec.check()?;
     let metrics = Metrics::new()?;
     let models = Models::load(&job.models, metrics.clone())?;
+    let tracker = job.tracker.apply(models.calibrate(TrackerConfig::default()))?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .thread_name("async")
         .worker_threads(1)
         .enable_all()
         .build()?;
-    let tracked = runtime.block_on(run(spec, models, metrics, job, out));
+    let tracked = runtime.block_on(run(spec, models, tracker, metrics, job, out));
     out.finish()?;
     tracked
 }
@@ -47,6 +49,7 @@ pub fn track(input: &str, job: &Job, out: &mut Output) -> Result<Tracked> {
 async fn run(
     spec: SourceSpec,
     models: Models,
+    tracker: TrackerConfig,
     metrics: std::sync::Arc<Metrics>,
     job: &Job,
     out: &mut Output,
@@ -59,7 +62,7 @@ async fn run(
         id: CameraId::new("input")?,
         epoch: Epoch(SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs())),
         spec,
-        tracker: job.tracker.clone(),
+        tracker,
         outlet: Box::new(Collector(collector)),
         policy: if live { Policy::NewestWins } else { Policy::Wait },
     };
