@@ -111,7 +111,8 @@ impl Config {
     pub fn parse(text: &str) -> Result<Self> {
         let config: Config = toml::from_str(text).map_err(|error| {
             // The snippet that TOML's error quotes may hold a camera's password.
-            let line = error.span().map_or(0, |span| text[..span.start.min(text.len())].matches('\n').count() + 1);
+            let line =
+                error.span().map_or(0, |span| text[..span.start.min(text.len())].matches('\n').count() + 1);
             anyhow::anyhow!("line {line}: {}", error.message())
         })?;
         config.tracker.apply(TrackerConfig::default())?;
@@ -207,7 +208,10 @@ impl TrackerOptions {
         positive("lambda_c", self.lambda_c, &mut base.filter.adaptation.lambda)?;
         positive("gate", self.gate, &mut base.gate.mahalanobis)?;
         if let Some(coast) = self.coast_s {
-            ensure!((0.0..=base.life.lost).contains(&coast), "tracker.coast_s = {coast}: must be from 0 to lost_s");
+            ensure!(
+                (0.0..=base.life.lost).contains(&coast),
+                "tracker.coast_s = {coast}: must be from 0 to lost_s"
+            );
             base.life.coast = coast;
         }
         if let Some(hits) = self.confirm_hits {
@@ -231,11 +235,17 @@ impl TrackerOptions {
             base.gate.innovation = !literal;
         }
         if let Some(weight) = self.appearance_weight {
-            ensure!(weight.is_finite() && weight >= 0.0, "tracker.appearance_weight = {weight}: must not be negative");
+            ensure!(
+                weight.is_finite() && weight >= 0.0,
+                "tracker.appearance_weight = {weight}: must not be negative"
+            );
             base.appearance.weight = weight;
         }
         if let Some(pivot) = self.appearance_pivot {
-            ensure!((-1.0..=1.0).contains(&pivot), "tracker.appearance_pivot = {pivot}: must be from -1 to 1");
+            ensure!(
+                (-1.0..=1.0).contains(&pivot),
+                "tracker.appearance_pivot = {pivot}: must be from -1 to 1"
+            );
             base.appearance.pivot = pivot;
         }
         Ok(base)
@@ -282,7 +292,10 @@ mod tests {
             ("liste = 1", "unknown field `liste`"),
             ("[models]\nthread = 2", "line 2: unknown field `thread`"),
             ("[[camera]]\nid = \"a b\"\nurl = \"x\"", "not usable"),
-            ("[[camera]]\nid = \"a\"\nurl = \"x\"\n[[camera]]\nid = \"a\"\nurl = \"y\"", "two cameras are named \"a\""),
+            (
+                "[[camera]]\nid = \"a\"\nurl = \"x\"\n[[camera]]\nid = \"a\"\nurl = \"y\"",
+                "two cameras are named \"a\"",
+            ),
             ("[tracker]\nhigh_score = 7", "tracker.high_score = 7: must be from 0 to 1"),
             ("[tracker]\ncost = \"x\"", "must be \"blend\" or \"log-link\""),
             ("[tracker]\nlost_s = nan", "tracker.lost_s"),

@@ -127,8 +127,7 @@ impl Metrics {
     /// Registers every metric, and the process's own, in a new registry.
     pub fn new() -> prometheus::Result<Arc<Self>> {
         let registry = Registry::new();
-        registry
-            .register(Box::new(prometheus::process_collector::ProcessCollector::for_self()))?;
+        registry.register(Box::new(prometheus::process_collector::ProcessCollector::for_self()))?;
         let counter = |name: &str, help: &str, labels: &[&str]| -> prometheus::Result<IntCounterVec> {
             let vec = IntCounterVec::new(Opts::new(name, help), labels)?;
             registry.register(Box::new(vec.clone()))?;
@@ -148,7 +147,11 @@ impl Metrics {
             };
         let metrics = Self {
             frames_in: counter("gakp_frames_in_total", "Frames that left the decoder.", &["camera"])?,
-            frames_tracked: counter("gakp_frames_tracked_total", "Frames tracked and published.", &["camera"])?,
+            frames_tracked: counter(
+                "gakp_frames_tracked_total",
+                "Frames tracked and published.",
+                &["camera"],
+            )?,
             frames_dropped: counter(
                 "gakp_frames_dropped_total",
                 "Frames that were not tracked, by reason.",
@@ -174,7 +177,12 @@ impl Metrics {
                 &["camera"],
                 &LATENCY_BUCKETS,
             )?,
-            stage: histogram("gakp_stage_seconds", "Time of a frame in a stage.", &["stage"], &STAGE_BUCKETS)?,
+            stage: histogram(
+                "gakp_stage_seconds",
+                "Time of a frame in a stage.",
+                &["stage"],
+                &STAGE_BUCKETS,
+            )?,
             queue: gauge("gakp_queue_depth", "Entries waiting in a queue.", &["queue"])?,
             batch_size: histogram(
                 "gakp_batch_size",

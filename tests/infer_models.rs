@@ -10,7 +10,7 @@ use std::sync::Arc;
 use futures::executor::block_on;
 use futures::future::join_all;
 use gakp::infer::bench::{FrameWork, models_alone};
-use gakp::infer::{InferError, ModelSettings, Models};
+use gakp::infer::{InferError, ModelSettings, Models, ProviderChoice};
 use gakp::track::{CANDIDATE_FEATURES, HISTORY, LinkRequest, Pair, STEP_FEATURES};
 use gakp::types::{BBox, ClassId, Image, YuvRange};
 use infer_support::{decode, fixture, image, models, settings, sha256};
@@ -250,7 +250,7 @@ fn models_alone_runs_every_frame() {
     let report = models_alone(&settings, &[work], 7).expect("a report");
     assert_eq!((report.frames, report.threads, report.batch), (7, 2, 1));
     assert!(report.frames_per_second() > 0.0);
-    assert!(report.detect > report.reid.min(report.link));
+    assert!(report.detect + report.reid + report.link <= 2 * report.wall);
     let nothing = models_alone(&settings, &[], 7).expect_err("no frames").to_string();
     assert!(nothing.contains("no frames"), "{nothing}");
 }
@@ -287,4 +287,35 @@ fn people_are_found_in_real_frames() {
         assert_eq!(found.len(), boxes.len(), "frame {frame}: {found:#?}");
         assert!(found.windows(2).all(|pair| pair[0].score >= pair[1].score));
     }
+}
+
+/// What a user gets without a single setting.
+#[test]
+fn the_default_models_answer() {
+    let Some(folder) = models() else { return };
+    if !fs::read_to_string(folder.join("manifest.toml")).expect("the manifest").contains("\"gakp-gru\"") {
+        return eprintln!("SKIPPED: the manifest has no entry for gakp-gru");
+    }
+    let settings =
+        ModelSettings { manifest: folder, provider: ProviderChoice::Cpu, ..ModelSettings::default() };
+    let models = load(&settings);
+    let report = &models.report;
+    assert_eq!(report.provider, "cpu");
+    let names: Vec<&str> = report.models.iter().map(|(_, name, _)| name.as_str()).collect();
+    assert_eq!(names, ["nanodet-g-int8", "builtin", "gakp-gru"]);
+    let frame = frame_with_block(640, 480, [100, 100, 200, 300]);
+    assert!(models.detector.detect_blocking(frame.clone()).expect("detections").is_empty());
+    let embedder = models.embedder.as_ref().expect("an embedder");
+    let boxes = vec![BBox::new(100.0, 100.0, 100.0, 200.0)];
+    assert!(embedder.embed_blocking(frame, boxes).expect("an embedding")[0].is_some());
+    let linker = models.linker.as_ref().expect("a linker");
+    let alone = linker.score_blocking(link_request()).expect("probabilities");
+    assert_eq!(alone.len(), 3);
+    // Requests of several cameras at once are answered as each alone.
+    let together = block_on(join_all((0..8).map(|_| linker.score(link_request()))));
+    for answer in together {
+        assert_eq!(answer.expect("probabilities"), alone);
+    }
+    models.shutdown();
+    assert!(matches!(linker.score_blocking(link_request()), Err(InferError::Stopped { model: "link" })));
 }

@@ -1,5 +1,7 @@
 //! The command line: one file a subcommand.
 
+#[cfg(feature = "service")]
+pub mod bench;
 #[cfg(feature = "testcam")]
 pub mod camera;
 pub mod eval;
@@ -43,6 +45,9 @@ pub enum Command {
     /// Serve a video as a real RTSP camera, over and over.
     #[cfg(feature = "testcam")]
     Camera(camera::Args),
+    /// Measure speed beside its limit.
+    #[cfg(feature = "service")]
+    Bench(bench::Args),
     /// Train the link scorer on MOTChallenge sequences.
     #[cfg(feature = "learn")]
     Train(train::Args),
@@ -62,6 +67,8 @@ pub fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Eval(args) => eval::run(args),
         #[cfg(feature = "testcam")]
         Command::Camera(args) => camera::run(args),
+        #[cfg(feature = "service")]
+        Command::Bench(args) => bench::run(args),
         #[cfg(feature = "learn")]
         Command::Train(args) => train::run(args),
     }

@@ -12,7 +12,7 @@ use tokio::sync::oneshot;
 
 use super::models::ModelArgs;
 use crate::api::{self, ApiConfig, NewCamera};
-use crate::config::Config;
+use crate::config::{Config, TrackerOptions};
 use crate::infer::Models;
 use crate::pipeline::{CameraSet, Lanes, MAX_CAMERAS, SetConfig, Store, source_spec};
 use crate::publish::{Hub, HubConfig};
@@ -78,7 +78,7 @@ struct Plan {
     cameras: Vec<NewCamera>,
     store: (Store, crate::pipeline::Remembered),
     limit: usize,
-    tracker: TrackerConfig,
+    tracker: TrackerOptions,
     models: crate::infer::ModelSettings,
 }
 
@@ -113,7 +113,7 @@ impl Plan {
             cameras,
             store: Store::open(&state_dir)?,
             limit,
-            tracker: config.tracker.apply(TrackerConfig::default())?,
+            tracker: config.tracker,
             models: crate::config::ModelConfig::from(args.models).or(config.models).settings()?,
         })
     }
@@ -165,6 +165,7 @@ async fn start(plan: Plan) -> Result<Service> {
     let (settings, observer) = (plan.models, metrics.clone());
     let models = tokio::task::spawn_blocking(move || Models::load(&settings, observer)).await??;
     metrics.provider(models.report.provider);
+    let tracker = plan.tracker.apply(models.calibrate(TrackerConfig::default()))?;
     let hub = Hub::new(HubConfig::default(), models.detector.classes().into());
     hub.metrics().register(metrics.registry())?;
     let lanes = Lanes::start(models, metrics.clone())?;
@@ -177,7 +178,7 @@ async fn start(plan: Plan) -> Result<Service> {
         lanes,
         hub: hub.clone(),
         metrics: metrics.clone(),
-        tracker: plan.tracker,
+        tracker,
         store: Some(plan.store),
         limit: plan.limit,
     });

@@ -42,7 +42,7 @@ impl Letterbox {
     }
 
     /// A box of the input, given by its corners, in pixels of the frame.
-    pub(super) fn to_frame(&self, [x0, y0, x1, y1]: [f32; 4]) -> BBox {
+    pub(super) fn frame_box(&self, [x0, y0, x1, y1]: [f32; 4]) -> BBox {
         let back = |value: f32, axis: usize| (f64::from(value) - self.offset[axis]) / self.scale[axis];
         let (left, top) = (back(x0, 0), back(y0, 1));
         BBox::new(left, top, back(x1, 0) - left, back(y1, 1) - top)
@@ -93,7 +93,7 @@ mod tests {
             for frame in [(640, 480), (1919, 1079), (33, 777), (1, 1)] {
                 let letterbox = Letterbox::new(&spec(fit), (352, 288), frame, true);
                 let Placement { x, y, w, h, .. } = letterbox.place;
-                let found = letterbox.to_frame([x, y, x + w, y + h].map(|v| v as f32));
+                let found = letterbox.frame_box([x, y, x + w, y + h].map(|v| v as f32));
                 let expected = BBox::new(0.0, 0.0, frame.0.into(), frame.1.into());
                 assert!(found.iou(&expected) > 1.0 - 1e-9, "{fit:?} {frame:?}: {found:?}");
             }

@@ -144,7 +144,7 @@ impl DetectModel {
 
     /// A tensor that holds `batch` copies of a frame, and its shape.
     pub(crate) fn tensor(&mut self, image: &Image, batch: usize) -> ([usize; 4], Vec<f32>) {
-        let batch = batch.min(self.most);
+        let batch = self.spec.input.shape[0].fixed().unwrap_or(batch.min(self.most));
         let mut shape = [batch, 3, 0, 0];
         for at in 0..batch {
             let place = self.prepare(image, at).place;
@@ -164,15 +164,21 @@ impl DetectModel {
             images.iter().enumerate().map(|(at, image)| self.prepare(image, at)).collect();
         let (width, height) = (letterboxes[0].place.width, letterboxes[0].place.height);
         let (spec, candidates) = (&self.spec, &mut self.candidates);
-        let shape = [images.len(), 3, height, width];
-        let tensor = &self.tensor[..shape.iter().product()];
+        // A graph of a fixed batch is filled up with what the tensor held before.
+        let filled = spec.input.shape[0].fixed().unwrap_or(images.len());
+        let shape = [filled, 3, height, width];
+        let length = shape.iter().product();
+        if self.tensor.len() < length {
+            self.tensor.resize(length, 0.0);
+        }
+        let tensor = &self.tensor[..length];
         self.graph.run(shape, tensor, |axes, output| {
             let &[batch, rows, columns] = axes else {
                 return Err(format!("the output has the shape {axes:?}, three axes are expected"));
             };
             let (rows, columns) = (rows as usize, columns as usize);
-            if batch as usize != images.len() {
-                return Err(format!("{batch} outputs for {} frames", images.len()));
+            if batch as usize != filled {
+                return Err(format!("{batch} outputs for {filled} frames"));
             }
             let mut answers = Vec::with_capacity(images.len());
             for (index, letterbox) in letterboxes.iter().enumerate() {
@@ -189,7 +195,7 @@ impl DetectModel {
 
 /// A candidate in the frame; a box without an area is none.
 fn detection(letterbox: &Letterbox, candidate: &Candidate) -> Option<Detection> {
-    let bbox = letterbox.to_frame(candidate.corners);
+    let bbox = letterbox.frame_box(candidate.corners);
     let score = f64::from(candidate.score).min(1.0);
     bbox.is_valid().then_some(Detection { bbox, score, class: ClassId(candidate.class) })
 }
@@ -223,5 +229,91 @@ impl BatchModel for DetectModel {
 
     fn session_time(&self) -> Duration {
         self.last
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::infer::testing::{fixture, runtime};
+    use crate::infer::{ColourOrder, Dim, Family, Fit, OutputSpec, Task};
+    use crate::types::{Plane, YuvMatrix, YuvRange};
+
+    /// The small detector of `tests/fixtures/infer`: it sees cells of 8x8 pixels that are bright.
+    fn entry(batch: Dim) -> ModelEntry {
+        let any = |name: &str| Dim::Dynamic(name.into());
+        ModelEntry {
+            name: "cells".into(),
+            task: Task::Detect,
+            family: Family::Yolox,
+            file: "yolox.onnx".into(),
+            sha256: String::new(),
+            license: String::new(),
+            source: String::new(),
+            input: Some(InputSpec {
+                name: "images".into(),
+                shape: vec![batch, Dim::Fixed(3), any("height"), any("width")],
+                width: 64,
+                height: 64,
+                multiple: 8,
+                colour: ColourOrder::Rgb,
+                mean: [0.0; 3],
+                std: [1.0; 3],
+                resize: Fit::LetterboxTopLeft,
+                pad: 0.0,
+            }),
+            output: Some(OutputSpec {
+                name: "output".into(),
+                shape: vec![any("batch"), any("points"), Dim::Fixed(6)],
+                classes: vec!["person".into()],
+                strides: vec![8],
+                score_threshold: Some(0.3),
+                nms_iou: Some(0.6),
+                width: None,
+            }),
+        }
+    }
+
+    /// A dark picture with one bright cell.
+    fn picture((width, height): (u32, u32), (x0, y0): (usize, usize)) -> Image {
+        let (w, h) = (width as usize, height as usize);
+        let mut bytes = vec![0; w * h];
+        for y in y0..y0 + 8 {
+            bytes[y * w + x0..y * w + x0 + 8].fill(255);
+        }
+        bytes.extend(vec![128; w * h / 2]);
+        let planes =
+            [(0, w), (w * h, w / 2), (w * h * 5 / 4, w / 2)].map(|(offset, stride)| Plane { offset, stride });
+        Image::i420((width, height), YuvRange::Full, YuvMatrix::Bt601, planes, Arc::new(bytes))
+            .expect("a picture")
+    }
+
+    #[test]
+    fn frames_of_many_shapes_are_batched() {
+        let Some(runtime) = runtime() else { return };
+        let frames: Vec<((u32, u32), (usize, usize))> = (0..11)
+            .map(|n| match n % 3 {
+                0 => ((64, 64), (n * 8 % 64, n / 4 * 8)),
+                1 => ((64, 32), (8, n / 4 * 8)),
+                _ => ((32, 64), (n / 4 * 8, 16)),
+            })
+            .collect();
+        let images: Vec<Image> = frames.iter().map(|&(size, at)| picture(size, at)).collect();
+        // As many as one call may hold; a file that takes two at a time.
+        for (batch, max_batch) in [(Dim::Dynamic("batch".into()), 4), (Dim::Fixed(2), 16)] {
+            let entry = entry(batch);
+            let spec = Arc::new(DetectSpec::new(&entry, &DetectorSettings::default()).expect("a detector"));
+            let arrangement = Arrangement { workers: 1, max_batch, max_wait: Duration::ZERO, capacity: 1 };
+            let file = fixture("yolox.onnx");
+            let mut model = DetectModel::load(&runtime, &entry, &file, arrangement, spec).expect("the graph");
+            let answers = model.run(&images).expect("detections");
+            assert_eq!(answers.len(), frames.len());
+            for (&(size, (x, y)), found) in frames.iter().zip(answers) {
+                assert_eq!(found.len(), 1, "{size:?}: {found:?}");
+                let expected = BBox::new(x as f64, y as f64, 8.0, 8.0);
+                assert!(found[0].bbox.iou(&expected) > 0.999, "{size:?}: {found:?}");
+            }
+            assert!(model.session_time() > Duration::ZERO);
+        }
     }
 }

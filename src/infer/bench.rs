@@ -93,7 +93,6 @@ pub fn models_alone(
             })
             .collect();
         barrier.wait();
-        let start = Instant::now();
         let mut report = AloneReport {
             frames,
             threads,
@@ -103,13 +102,20 @@ pub fn models_alone(
             reid: Duration::ZERO,
             link: Duration::ZERO,
         };
+        let (mut first, mut last) = (None, None);
         for run in runs {
-            let [detect, reid, link] = run.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
+            let (start, end, [detect, reid, link]) =
+                run.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
             report.detect += detect;
             report.reid += reid;
             report.link += link;
+            // This thread may wake up late from the barrier: the workers' own clocks count.
+            first = Some(first.map_or(start, |first: Instant| first.min(start)));
+            last = last.max(Some(end));
         }
-        report.wall = start.elapsed();
+        if let (Some(first), Some(last)) = (first, last) {
+            report.wall = last - first;
+        }
         Ok(report)
     })
 }
@@ -139,7 +145,8 @@ impl Instance {
         let reid = match &plan.reid {
             Reid::None => None,
             Reid::Stripes => Some(EmbedModel::Stripes(Box::default())),
-            Reid::Network(Chosen { entry, file }) => {
+            Reid::Network(network) => {
+                let Chosen { entry, file } = &**network;
                 let arrangement = runtime.provider.arrangement(Task::Reid, settings.threads);
                 let mut network = NetworkModel::load(runtime, entry, file, arrangement)?;
                 network.warm_up()?;
@@ -153,10 +160,12 @@ impl Instance {
         Ok(Self { detector, tensors, reid, link })
     }
 
-    /// Runs a share of the frames; the time in the detector, the appearance model and the link scorer.
-    fn run(mut self, work: &[FrameWork], share: usize, batch: usize) -> Result<[Duration; 3], InferError> {
+    /// Runs a share of the frames. When it began and ended, and the time in the detector, the
+    /// appearance model and the link scorer.
+    fn run(mut self, work: &[FrameWork], share: usize, batch: usize) -> Result<Span, InferError> {
         let mut spent = [Duration::ZERO; 3];
-        let mut clock = Instant::now();
+        let start = Instant::now();
+        let mut clock = start;
         let mut lap = |spent: &mut Duration| {
             let now = Instant::now();
             *spent += now - clock;
@@ -184,6 +193,9 @@ impl Instance {
             }
             lap(&mut spent[2]);
         }
-        Ok(spent)
+        Ok((start, clock, spent))
     }
 }
+
+/// Beginning, end, time in each model.
+type Span = (Instant, Instant, [Duration; 3]);

@@ -199,3 +199,46 @@ impl BatchModel for LinkModel {
         self.last
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::infer::testing::{fixture, runtime};
+    use crate::track::Pair;
+
+    /// A request of `tracks` histories and a pair of each `(track)` of `pairs`.
+    fn request(seed: usize, tracks: usize, pairs: &[u32]) -> LinkRequest {
+        let pattern = |n: usize| (0..n).map(|i| ((i + seed) % 11) as f32 / 10.0 - 0.5).collect();
+        LinkRequest {
+            histories: pattern(tracks * HISTORY * STEP_FEATURES),
+            lengths: (0..tracks).map(|track| ((track + seed) % HISTORY + 1) as i32).collect(),
+            candidates: pattern(pairs.len() * CANDIDATE_FEATURES),
+            pairs: pairs.iter().map(|&track| Pair { track, detection: 0 }).collect(),
+        }
+    }
+
+    #[test]
+    fn requests_of_many_cameras_are_one_call() {
+        let Some(runtime) = runtime() else { return };
+        let mut model = LinkModel::load(&runtime, "link", &fixture("link.onnx")).expect("the graph");
+        // One has histories and no pairs, one has neither.
+        let requests = [
+            request(0, 3, &[2, 0, 0, 1]),
+            request(1, 2, &[]),
+            request(2, 1, &[0]),
+            LinkRequest::default(),
+            request(5, 4, &[3, 1]),
+        ];
+        let together = model.run(&requests).expect("probabilities");
+        for (request, together) in requests.iter().zip(&together) {
+            let alone = &model.run(std::slice::from_ref(request)).expect("probabilities")[0];
+            assert_eq!(alone.len(), request.pairs.len());
+            assert_eq!(together.len(), alone.len());
+            for (a, b) in alone.iter().zip(together) {
+                assert!((a - b).abs() < 1e-6, "{alone:?} alone, {together:?} together");
+            }
+        }
+        assert!((together[0][0] - together[0][1]).abs() > 1e-4, "the tracks differ: {together:?}");
+        assert_eq!(model.run(&[LinkRequest::default()]).expect("nothing"), [vec![0f32; 0]]);
+    }
+}

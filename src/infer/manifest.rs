@@ -11,6 +11,7 @@ use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use super::InferError;
+use crate::track::TrackerConfig;
 
 /// A manifest and the folder it lies in.
 #[derive(Clone, Debug)]
@@ -190,6 +191,39 @@ pub struct OutputSpec {
     pub nms_iou: Option<f64>,
     /// `reid`: numbers in a vector.
     pub width: Option<usize>,
+    /// What the tracker should know of the model's numbers.
+    #[serde(default)]
+    pub tracking: Calibration,
+}
+
+/// A model's numbers as the tracker reads them; what is not given is the tracker's default.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Calibration {
+    /// `detect`: detections from this score on are trusted ([`AssociationConfig::high_score`]).
+    ///
+    /// [`AssociationConfig::high_score`]: crate::track::AssociationConfig::high_score
+    pub high_score: Option<f64>,
+    /// `detect`: least score of a birth.
+    pub birth_score: Option<f64>,
+    /// `reid`: logits that a unit of cosine similarity is worth.
+    pub appearance_weight: Option<f64>,
+    /// `reid`: the cosine similarity that says nothing either way.
+    pub appearance_pivot: Option<f64>,
+}
+
+impl Calibration {
+    /// `tracker` with what is known of the model.
+    pub fn apply(&self, tracker: &mut TrackerConfig) {
+        for (value, into) in [
+            (self.high_score, &mut tracker.association.high_score),
+            (self.birth_score, &mut tracker.birth.score),
+            (self.appearance_weight, &mut tracker.appearance.weight),
+            (self.appearance_pivot, &mut tracker.appearance.pivot),
+        ] {
+            *into = value.unwrap_or(*into);
+        }
+    }
 }
 
 fn one() -> usize {

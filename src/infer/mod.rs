@@ -11,11 +11,15 @@ mod models;
 mod picture;
 mod runtime;
 mod scale;
+#[cfg(test)]
+pub(crate) mod testing;
 
 pub use batcher::{Arrangement, BatchModel, BatchStats, Batcher, Observer};
 pub use error::InferError;
 pub use linker::Linker;
-pub use manifest::{ColourOrder, Dim, Family, Fit, InputSpec, Manifest, ModelEntry, OutputSpec, Task};
+pub use manifest::{
+    Calibration, ColourOrder, Dim, Family, Fit, InputSpec, Manifest, ModelEntry, OutputSpec, Task,
+};
 pub use models::{ModelSettings, Models, Report};
 pub use runtime::{Provider, ProviderChoice, Runtime};
 

@@ -4,10 +4,12 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::{
-    Arrangement, InferError, Linker, Manifest, ModelEntry, Observer, Provider, ProviderChoice, Runtime, Task,
+    Arrangement, Calibration, InferError, Linker, Manifest, ModelEntry, Observer, Provider, ProviderChoice,
+    Runtime, Task,
 };
 use crate::detect::{Detector, DetectorSettings};
 use crate::embed::Embedder;
+use crate::track::TrackerConfig;
 
 /// What the user says about models.
 #[derive(Clone, Debug)]
@@ -58,6 +60,8 @@ pub struct Models {
     pub linker: Option<Linker>,
     /// What is really used.
     pub report: Arc<Report>,
+    /// What the tracker should know of the detector's and the appearance model's numbers.
+    pub calibration: [Calibration; 2],
 }
 
 /// What is really used, for logs and metrics.
@@ -113,7 +117,8 @@ impl Models {
                 let arrangement = arrange(Task::Reid, "builtin", Provider::Cpu);
                 Some(Embedder::start_stripes(arrangement, observer.clone())?)
             }
-            Reid::Network(Chosen { entry, file }) => {
+            Reid::Network(network) => {
+                let Chosen { entry, file } = &**network;
                 let arrangement = arrange(Task::Reid, &entry.name, runtime.provider);
                 Some(Embedder::start_network(runtime, entry, file, arrangement, observer.clone())?)
             }
@@ -130,7 +135,21 @@ impl Models {
             library = %report.library.display(),
             "models are ready"
         );
-        Ok(Self { detector, embedder, linker, report: Arc::new(report) })
+        let calibrated =
+            |chosen: &Chosen| chosen.entry.output.as_ref().map(|o| o.tracking).unwrap_or_default();
+        let appearance = match &plan.reid {
+            Reid::None => Calibration::default(),
+            Reid::Stripes => crate::embed::stripes::CALIBRATION,
+            Reid::Network(chosen) => calibrated(chosen),
+        };
+        let calibration = [calibrated(&plan.detector), appearance];
+        Ok(Self { detector, embedder, linker, report: Arc::new(report), calibration })
+    }
+
+    /// `tracker` with what is known of the models.
+    pub fn calibrate(&self, mut tracker: TrackerConfig) -> TrackerConfig {
+        self.calibration.iter().for_each(|calibration| calibration.apply(&mut tracker));
+        tracker
     }
 
     /// Stops all models: takes no more requests, answers those in the queues, joins the workers.
@@ -159,7 +178,7 @@ pub(super) struct Chosen {
 pub(super) enum Reid {
     None,
     Stripes,
-    Network(Chosen),
+    Network(Box<Chosen>),
 }
 
 impl Plan {
@@ -170,7 +189,7 @@ impl Plan {
         let reid = match settings.reid.as_str() {
             "none" => Reid::None,
             "builtin" => Reid::Stripes,
-            name => Reid::Network(choose(&manifest, Task::Reid, name)?),
+            name => Reid::Network(Box::new(choose(&manifest, Task::Reid, name)?)),
         };
         let link = match settings.link.as_str() {
             "none" => None,

@@ -101,23 +101,29 @@ impl Rasteriser {
                 place: Placement,
                 target: &mut Target<'_>,
             ) {
-                rasteriser.convert(image, matrix, place, target);
+                rasteriser.convert::<true>(image, matrix, place, target);
             }
             if std::arch::is_x86_feature_detected!("avx2") {
                 // SAFETY: the machine has AVX2.
                 return unsafe { convert_avx2(self, image, &matrix, place, &mut target) };
             }
         }
-        self.convert(image, &matrix, place, &mut target);
+        self.convert::<false>(image, &matrix, place, &mut target);
     }
 
     /// Scales, converts and normalises row by row, while a row is in the cache.
     #[inline(always)]
-    fn convert(&mut self, image: &Image, matrix: &ColourMatrix, place: Placement, target: &mut Target<'_>) {
+    fn convert<const AVX2: bool>(
+        &mut self,
+        image: &Image,
+        matrix: &ColourMatrix,
+        place: Placement,
+        target: &mut Target<'_>,
+    ) {
         let Placement { x, y, w, h, .. } = place;
         for row in 0..h {
             for (index, (plane, out)) in self.planes.iter_mut().zip(&mut self.rows).enumerate() {
-                plane.row(image, index, row, out);
+                plane.row::<AVX2>(image, index, row, out);
             }
             let [ys, us, vs] = &self.rows;
             for channel in 0..3 {
@@ -304,6 +310,13 @@ mod tests {
             });
             let mut tensor = vec![f32::NAN; 3 * place.width * place.height];
             rasteriser.write(&image, from, place, &normalisation, &mut tensor);
+            // Whatever the machine has, the result is the same.
+            let mut plain = tensor.clone();
+            let matrix = ColourMatrix::new(&image, &normalisation);
+            let mut target =
+                Target { tensor: &mut plain, width: place.width, area: place.width * place.height };
+            rasteriser.convert::<false>(&image, &matrix, place, &mut target);
+            assert_eq!(tensor, plain);
             let (mut worst, mut total) = (0f64, 0f64);
             for y in 0..place.height {
                 for x in 0..place.width {

@@ -58,12 +58,14 @@ pub(super) struct PlaneScaler {
     pub across: Axis,
     pub down: Axis,
     line: Vec<u16>,
+    halved: Vec<u16>,
 }
 
 impl PlaneScaler {
-    /// Writes output row `row` of plane `index` to `out`, values `0.0..=255.0`.
+    /// Writes output row `row` of plane `index` to `out`, values `0.0..=255.0`. With `AVX2` the machine
+    /// must have it.
     #[inline(always)]
-    pub(super) fn row(&mut self, image: &Image, index: usize, row: usize, out: &mut [f32]) {
+    pub(super) fn row<const AVX2: bool>(&mut self, image: &Image, index: usize, row: usize, out: &mut [f32]) {
         let (bytes, stride) = image.plane(index);
         let Axis { level: across, first, blocks, .. } = self.across;
         let width = blocks << across;
@@ -94,19 +96,60 @@ impl PlaneScaler {
         }
 
         let mut length = width;
+        self.halved.resize(width / 2, 0);
         for _ in 0..across {
             length /= 2;
-            for i in 0..length {
-                line[i] = ((u32::from(line[2 * i]) + u32::from(line[2 * i + 1]) + 1) / 2) as u16;
+            let pairs = self.line[..2 * length].chunks_exact(2);
+            for (half, pair) in self.halved[..length].iter_mut().zip(pairs) {
+                *half = ((u32::from(pair[0]) + u32::from(pair[1])) / 2) as u16;
             }
+            self.line[..length].copy_from_slice(&self.halved[..length]);
         }
         self.line[blocks] = self.line[blocks - 1];
         let line = &self.line[..blocks + 1];
-        let (at, towards) = (&self.across.at[..out.len()], &self.across.towards[..out.len()]);
-        for i in 0..out.len() {
-            let place = at[i] as usize;
-            let (left, right) = (f32::from(line[place]), f32::from(line[place + 1]));
-            out[i] = (left + (right - left) * towards[i]) * (1.0 / UNIT as f32);
+        #[cfg(target_arch = "x86_64")]
+        if AVX2 {
+            // SAFETY: the machine has AVX2, and every place has a block to its right in `line`, which is
+            // what `Axis::set` makes and the extra block is for.
+            return unsafe { pick_avx2(line, &self.across, out) };
+        }
+        pick(line, &self.across, 0, out);
+    }
+}
+
+/// Interpolates between the blocks of a joined row, from output pixel `from` on.
+#[inline(always)]
+fn pick(line: &[u16], across: &Axis, from: usize, out: &mut [f32]) {
+    let (at, towards) = (&across.at[..out.len()], &across.towards[..out.len()]);
+    for i in from..out.len() {
+        let place = at[i] as usize;
+        let (left, right) = (f32::from(line[place]), f32::from(line[place + 1]));
+        out[i] = (left + (right - left) * towards[i]) * (1.0 / UNIT as f32);
+    }
+}
+
+/// [`pick`], eight at a time: one gather brings a block and its right neighbour.
+///
+/// # Safety
+/// `line` must have an element after every place of `across`.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+unsafe fn pick_avx2(line: &[u16], across: &Axis, out: &mut [f32]) {
+    use std::arch::x86_64::*;
+    debug_assert!(across.at.iter().all(|&at| (at as usize) + 1 < line.len()));
+    let (low, scale) = (_mm256_set1_epi32(0xffff), _mm256_set1_ps(1.0 / UNIT as f32));
+    let places = across.at.chunks_exact(8).zip(across.towards.chunks_exact(8));
+    for (out, (at, towards)) in out.chunks_exact_mut(8).zip(places) {
+        // SAFETY: the slices hold eight each; the places are inside `line` with their neighbour.
+        unsafe {
+            let at = _mm256_loadu_si256(at.as_ptr().cast());
+            let towards = _mm256_loadu_ps(towards.as_ptr());
+            let pairs = _mm256_i32gather_epi32::<2>(line.as_ptr().cast(), at);
+            let left = _mm256_cvtepi32_ps(_mm256_and_si256(pairs, low));
+            let right = _mm256_cvtepi32_ps(_mm256_srli_epi32::<16>(pairs));
+            let between = _mm256_mul_ps(_mm256_sub_ps(right, left), towards);
+            _mm256_storeu_ps(out.as_mut_ptr(), _mm256_mul_ps(_mm256_add_ps(left, between), scale));
         }
     }
+    pick(line, across, out.len() / 8 * 8, out);
 }

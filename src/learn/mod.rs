@@ -1,1 +1,33 @@
-//! learn
+//! Training the link network: examples, a GRU with hand-written gradients, Adam, ONNX out.
+//!
+//! ```text
+//! sequences -> tracker driven by the truth -> examples -> fit -> LinkModel -> ONNX, model card
+//! ```
+//!
+//! Not part of the service: the service runs the ONNX file. [`GruScorer`] computes the same without
+//! ONNX Runtime, [`literal`] computes it the way the paper prints it, one pair at a time.
+
+mod activate;
+mod adam;
+pub mod card;
+pub mod dataset;
+mod examples;
+mod fit;
+mod gemm;
+mod gru;
+pub mod literal;
+pub mod metrics;
+mod model;
+pub mod onnx;
+mod recipe;
+mod scorer;
+mod teacher;
+
+pub use adam::{Adam, Schedule};
+pub use examples::Examples;
+pub use fit::{Fit, Progress, fit, logits};
+pub use gru::{Batch, Gru, GruShape, Tape};
+pub use model::{LinkModel, Normaliser};
+pub use recipe::Recipe;
+pub use scorer::GruScorer;
+pub use teacher::Teacher;

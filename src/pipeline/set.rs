@@ -262,7 +262,9 @@ fn status(shown: &Shown) -> CameraStatus {
         since: Timestamp::try_from(condition.since).unwrap_or(Timestamp::UNIX_EPOCH),
         last_error_kind: condition.last_failure.as_ref().map(|f| f.label().to_string()),
         last_error: condition.last_failure.map(|f| f.to_string()),
-        next_retry_s: condition.next_retry.map(|at| at.saturating_duration_since(Instant::now()).as_secs_f64()),
+        next_retry_s: condition
+            .next_retry
+            .map(|at| at.saturating_duration_since(Instant::now()).as_secs_f64()),
         reconnects: metrics.reconnects.get(),
         epoch: view.epoch.0,
         width: condition.size.map(|s| s.0),

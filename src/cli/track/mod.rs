@@ -4,15 +4,16 @@ mod progress;
 mod sequence;
 mod video;
 
+pub(super) use video::track as track_video;
+
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 
 use super::models::ModelArgs;
-use crate::config::{Config, ModelConfig};
+use crate::config::{Config, ModelConfig, TrackerOptions};
 use crate::infer::ModelSettings;
-use crate::track::TrackerConfig;
 
 /// Tracks a video, a URL or a MOTChallenge sequence, and writes MOTChallenge rows.
 ///
@@ -44,12 +45,12 @@ pub struct Args {
 }
 
 /// What every kind of input needs.
-struct Job {
-    tracker: TrackerConfig,
-    models: ModelSettings,
-    frames: Option<u64>,
-    second_half: bool,
-    video: Option<PathBuf>,
+pub(super) struct Job {
+    pub tracker: TrackerOptions,
+    pub models: ModelSettings,
+    pub frames: Option<u64>,
+    pub second_half: bool,
+    pub video: Option<PathBuf>,
 }
 
 /// Runs the command.
@@ -59,7 +60,7 @@ struct Job {
 pub fn run(args: Args) -> Result<()> {
     let config = args.config.as_deref().map(Config::read).transpose()?.unwrap_or_default();
     let job = Job {
-        tracker: config.tracker.apply(TrackerConfig::default())?,
+        tracker: config.tracker,
         models: ModelConfig::from(args.models).or(config.models).settings()?,
         frames: args.frames,
         second_half: args.second_half,
@@ -78,7 +79,7 @@ pub fn run(args: Args) -> Result<()> {
                 bail!("--second-half is for MOTChallenge sequence folders");
             }
             let mut out = Output::create(&args.out)?;
-            video::track(input, &job, &mut out)
+            video::track(input, &job, &mut out).map(|_| ())
         }
         [folder] => {
             let mut out = Output::create(&args.out)?;
@@ -95,14 +96,14 @@ pub fn run(args: Args) -> Result<()> {
 
 /// Where rows go. A file is not touched before there is something to write: a mistake in the input
 /// must not cost the rows of an earlier run.
-struct Output {
+pub(super) struct Output {
     name: String,
     path: PathBuf,
     file: Option<Box<dyn Write>>,
 }
 
 impl Output {
-    fn create(path: &Path) -> Result<Self> {
+    pub fn create(path: &Path) -> Result<Self> {
         let (name, path) = (path.display().to_string(), path.to_path_buf());
         if name == "-" {
             let file: Box<dyn Write> = Box::new(std::io::stdout().lock());
@@ -134,7 +135,9 @@ impl Output {
             Some(file) => file,
             None => {
                 let file = std::fs::File::create(&self.path);
-                Box::new(std::io::BufWriter::new(file.with_context(|| format!("cannot write {}", self.name))?))
+                Box::new(std::io::BufWriter::new(
+                    file.with_context(|| format!("cannot write {}", self.name))?,
+                ))
             }
         };
         Ok(self.file.insert(file))

@@ -8,6 +8,7 @@ use anyhow::{Context, Result};
 use super::{Job, Output, progress};
 use crate::infer::Linker;
 use crate::mot::{Sequence, SequenceInfo, replay};
+use crate::track::TrackerConfig;
 
 /// Tracks several folders into `out/SEQ.txt`.
 pub fn track_all(inputs: &[String], out: &Path, job: &Job) -> Result<()> {
@@ -37,7 +38,8 @@ fn track_one(sequence: &Sequence, linker: &Linker, job: &Job, out: &mut Output) 
         bar.set_position(frame as u64 + 1);
         Vec::new()
     };
-    let rows = replay(sequence, &job.tracker, embeddings, |request| linker.score_blocking(request.clone()))?;
+    let config = job.tracker.apply(TrackerConfig::default())?;
+    let rows = replay(sequence, &config, embeddings, |request| linker.score_blocking(request.clone()))?;
     bar.finish_and_clear();
     out.write(&rows)?;
     out.finish()

@@ -14,31 +14,46 @@ use crate::mot::report_rows;
 use crate::pipeline::{Camera, CameraPlan, CameraState, Collector, Lanes, Policy};
 use crate::publish::{Rgb, RgbConverter, Trails, annotate};
 use crate::telemetry::Metrics;
+use crate::track::TrackerConfig;
 use crate::types::{CameraId, Epoch};
 
 /// Tracked frames that may wait to be written.
 const UNWRITTEN: usize = 4;
 
+/// How much was tracked, and how long it took from opening the source to the last frame.
+pub struct Tracked {
+    /// Frames.
+    pub frames: u64,
+    /// Seconds; loading models is not in it.
+    pub seconds: f64,
+}
+
 /// Tracks `input` to its end, to `job.frames`, or until Ctrl-C.
-pub fn track(input: &str, job: &Job, out: &mut Output) -> Result<()> {
+pub fn track(input: &str, job: &Job, out: &mut Output) -> Result<Tracked> {
     let mut spec = SourceSpec::parse(input)?;
     spec.pacing = Pacing::AsFastAsPossible;
     spec.check()?;
     let metrics = Metrics::new()?;
     let models = Models::load(&job.models, metrics.clone())?;
-    let runtime =
-        tokio::runtime::Builder::new_multi_thread().thread_name("async").worker_threads(1).enable_all().build()?;
-    runtime.block_on(run(spec, models, metrics, job, out))?;
-    out.finish()
+    let tracker = job.tracker.apply(models.calibrate(TrackerConfig::default()))?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .thread_name("async")
+        .worker_threads(1)
+        .enable_all()
+        .build()?;
+    let tracked = runtime.block_on(run(spec, models, tracker, metrics, job, out))?;
+    out.finish()?;
+    Ok(tracked)
 }
 
 async fn run(
     spec: SourceSpec,
     models: Models,
+    tracker: TrackerConfig,
     metrics: std::sync::Arc<Metrics>,
     job: &Job,
     out: &mut Output,
-) -> Result<()> {
+) -> Result<Tracked> {
     let lanes = Lanes::start(models, metrics)?;
     let name = spec.url.redacted().to_string();
     let live = spec.retries();
@@ -47,12 +62,13 @@ async fn run(
         id: CameraId::new("input")?,
         epoch: Epoch(SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs())),
         spec,
-        tracker: job.tracker.clone(),
+        tracker,
         outlet: Box::new(Collector(collector)),
         policy: if live { Policy::NewestWins } else { Policy::Wait },
     };
     let camera = Camera::start(&lanes, plan).await?;
-    let short = Path::new(&name).file_name().map_or_else(|| name.clone(), |n| n.to_string_lossy().into_owned());
+    let short =
+        Path::new(&name).file_name().map_or_else(|| name.clone(), |n| n.to_string_lossy().into_owned());
     let bar = progress::frames(job.frames, &short);
     let mut film = job.video.as_deref().map(Film::new);
     let (mut frames, start) = (0u64, Instant::now());
@@ -66,9 +82,10 @@ async fn run(
         };
         let Some(picture) = picture else { break };
         let condition = camera.view().condition();
-        if let (Some(length), Some(fps)) =
-            (condition.opened.as_ref().and_then(|o| o.duration), condition.opened.as_ref().and_then(|o| o.fps))
-        {
+        if let (Some(length), Some(fps)) = (
+            condition.opened.as_ref().and_then(|o| o.duration),
+            condition.opened.as_ref().and_then(|o| o.fps),
+        ) {
             bar.set_length((length.as_secs_f64() * fps).round() as u64);
         }
         frames += 1;
@@ -103,7 +120,7 @@ async fn run(
         bail!("{name}: {reason}");
     }
     tracing::info!(frames, seconds, frames_per_second = frames as f64 / seconds, "tracked");
-    Ok(())
+    Ok(Tracked { frames, seconds })
 }
 
 /// The annotated copy.

@@ -1,0 +1,303 @@
+//! `gakp train`: trains the link network on MOTChallenge folders.
+
+use std::collections::BTreeMap;
+use std::convert::Infallible;
+use std::path::{Path, PathBuf};
+use std::{fs, thread};
+
+use anyhow::{Context, Result, bail, ensure};
+use indicatif::{ProgressBar, ProgressStyle};
+use serde::{Deserialize, Serialize};
+
+use crate::learn::card::{Card, LICENCE, Unseen};
+use crate::learn::dataset::{self, LabelledSequence};
+use crate::learn::{Examples, Fit, GruScorer, LinkModel, Recipe, Teacher, fit, logits, metrics, onnx};
+use crate::mot::{Benchmark, Sequence, SequenceInfo, evaluate, first_half_length, parse_truth, replay};
+use crate::track::TrackerConfig;
+
+/// Trains the network that says how probable it is that a detection continues a track.
+///
+/// ROOTs are MOTChallenge sequences (gt/gt.txt, det/det.txt, seqinfo.ini) or folders of them. Writes an
+/// ONNX file and, beside it, a model card. The same input and settings give the same file.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Args {
+    /// Sequences, or folders of sequences.
+    #[arg(required = true, value_name = "ROOT")]
+    pub roots: Vec<PathBuf>,
+    /// ONNX file to write; with --loso a folder, for one file each footage.
+    #[arg(long, value_name = "FILE")]
+    pub out: PathBuf,
+    /// Hold out every sequence whose footage or name contains this, and score the network on them.
+    #[arg(long, value_name = "TEXT")]
+    pub exclude: Vec<String>,
+    /// Leave one sequence out: for each footage that contains TEXT (all, without it) a network that has
+    /// seen none of its copies, OUT/FOOTAGE.onnx.
+    #[arg(long, value_name = "TEXT", num_args = 0..=1, default_missing_value = "")]
+    pub loso: Option<String>,
+    /// Score sequences whose names end in -SUFFIX on their second half alone (their detector was trained
+    /// on the first).
+    #[arg(long, value_name = "SUFFIX")]
+    pub second_half: Vec<String>,
+    /// Seed of everything random.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Passes over the examples.
+    #[arg(long, default_value_t = Fit::default().epochs as u64, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub epochs: u64,
+    /// Width of the hidden state.
+    #[arg(long, default_value_t = Fit::default().hidden as u64, value_parser = clap::value_parser!(u64).range(1..=1024))]
+    pub hidden: u64,
+    /// Examples to make.
+    #[arg(long, default_value_t = Recipe::default().examples as u64, value_parser = clap::value_parser!(u64).range(1000..=20_000_000))]
+    pub examples: u64,
+    /// Threads; they do not change the result.
+    #[arg(long, value_name = "N")]
+    pub threads: Option<usize>,
+    /// Write the scores on held-out sequences as JSON.
+    #[arg(long, value_name = "FILE")]
+    pub report: Option<PathBuf>,
+    /// A report of a --loso run: its scores go into the model card.
+    #[arg(long, value_name = "FILE")]
+    pub unseen: Option<PathBuf>,
+}
+
+/// Scores on held-out sequences.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct Report {
+    /// One entry a sequence.
+    pub unseen: Vec<Unseen>,
+}
+
+/// A sequence and where its files are.
+struct Source {
+    folder: PathBuf,
+    labelled: LabelledSequence,
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// Data that cannot be read or is wrong, names that match nothing, and files that cannot be written.
+pub fn run(args: Args) -> Result<()> {
+    let sources = load(&args.roots)?;
+    let mut report = match &args.unseen {
+        Some(path) => {
+            let text = fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+            serde_json::from_str(&text).with_context(|| format!("{} is no report", path.display()))?
+        }
+        None => Report::default(),
+    };
+    if let Some(name) = &args.loso {
+        let mut groups: Vec<&str> = sources.iter().map(|s| s.labelled.group.as_str()).collect();
+        groups.retain(|g| g.contains(name.as_str()));
+        groups.dedup();
+        ensure!(!groups.is_empty(), "--loso {name:?}: no footage has that in its name");
+        fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+        for group in groups {
+            let out = args.out.join(format!("{group}.onnx"));
+            report.unseen.extend(train(&args, &sources, &|s| s.group == group, &out, &[])?);
+        }
+    } else {
+        let excluded = |s: &LabelledSequence| {
+            args.exclude.iter().any(|text| s.group.contains(text.as_str()) || s.name.contains(text.as_str()))
+        };
+        for text in &args.exclude {
+            let matches = |s: &Source| s.labelled.name.contains(text) || s.labelled.group.contains(text);
+            ensure!(sources.iter().any(matches), "--exclude {text:?}: no sequence has that in its name");
+        }
+        // All copies of an excluded sequence go, whatever their names.
+        let groups: Vec<String> =
+            sources.iter().map(|s| &s.labelled).filter(|s| excluded(s)).map(|s| s.group.clone()).collect();
+        let out = args.out.clone();
+        let found = train(&args, &sources, &|s| groups.contains(&s.group), &out, &report.unseen)?;
+        report.unseen.extend(found);
+    }
+    if let Some(path) = &args.report {
+        write(path, (serde_json::to_string_pretty(&report)? + "\n").as_bytes())?;
+    }
+    Ok(())
+}
+
+fn load(roots: &[PathBuf]) -> Result<Vec<Source>> {
+    let mut sources = vec![];
+    for root in roots {
+        for folder in dataset::folders(root)? {
+            let labelled = dataset::load(&folder)?;
+            sources.push(Source { folder, labelled });
+        }
+    }
+    sources.sort_by(|a, b| a.labelled.name.cmp(&b.labelled.name));
+    if let Some(pair) = sources.windows(2).find(|w| w[0].labelled.name == w[1].labelled.name) {
+        let [a, b] = [&pair[0].folder, &pair[1].folder];
+        bail!("sequence {} is given twice: {} and {}", pair[0].labelled.name, a.display(), b.display());
+    }
+    Ok(sources)
+}
+
+/// Trains one network without the sequences that `held_out` names, writes it and its card, and scores
+/// it on them.
+fn train(
+    args: &Args,
+    sources: &[Source],
+    held_out: &dyn Fn(&LabelledSequence) -> bool,
+    out: &Path,
+    known: &[Unseen],
+) -> Result<Vec<Unseen>> {
+    let (held, seen): (Vec<&Source>, Vec<&Source>) = sources.iter().partition(|s| held_out(&s.labelled));
+    ensure!(!seen.is_empty(), "nothing to train on: every sequence is held out");
+    let name = out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    let recipe = Recipe { examples: args.examples as usize, seed: args.seed, ..Recipe::default() };
+    let examples = collect(&recipe, &seen, &name);
+    ensure!(
+        !examples.is_empty(),
+        "no pair in the training sequences: are there detections that overlap truth?"
+    );
+    let settings = Fit {
+        hidden: args.hidden as usize,
+        epochs: args.epochs as usize,
+        seed: args.seed,
+        threads: args.threads.or_else(|| thread::available_parallelism().ok().map(usize::from)).unwrap_or(1),
+        ..Fit::default()
+    };
+    let model = run_fit(&settings, &examples, &name);
+
+    let mut scores = vec![];
+    for source in &held {
+        let found = score(&model, source, &args.second_half)?;
+        println!(
+            "{name} {}: {} pairs, AUC {:.4}, cross-entropy {:.4}, calibration error {:.4}; HOTA {:.2} MOTA {:.2} IDF1 {:.2} IDs {}",
+            found.sequence,
+            found.pairs,
+            found.auc,
+            found.loss,
+            found.calibration_error,
+            found.hota,
+            found.mota,
+            found.idf1,
+            found.id_switches
+        );
+        scores.push(found);
+    }
+    let names = |of: &[&Source]| -> Vec<String> { of.iter().map(|s| s.labelled.name.clone()).collect() };
+    let mut card = Card {
+        file: name,
+        bytes: 0,
+        hidden: settings.hidden,
+        parameters: model.gru.theta.len(),
+        sequences: names(&seen),
+        excluded: names(&held),
+        examples: (examples.len(), examples.positive_share()),
+        settings: describe(&settings, &recipe),
+        unseen: known.iter().chain(&scores).cloned().collect(),
+    };
+    let mut metadata: BTreeMap<String, String> = card.settings.iter().cloned().collect();
+    metadata.insert("licence".into(), LICENCE.into());
+    metadata.insert("sequences".into(), card.sequences.join(" "));
+    metadata.insert("excluded".into(), card.excluded.join(" "));
+    let bytes = onnx::write(&model, "Probability that a detection continues a track", &metadata);
+    card.bytes = bytes.len();
+    write(out, &bytes)?;
+    write(&out.with_extension("md"), card.markdown().as_bytes())?;
+    println!("wrote {} ({} examples)", out.display(), examples.len());
+    Ok(scores)
+}
+
+fn collect(recipe: &Recipe, seen: &[&Source], name: &str) -> Examples {
+    let sequences: Vec<&LabelledSequence> = seen.iter().map(|s| &s.labelled).collect();
+    let bar = bar((sequences.len() * recipe.variants.len()) as u64, "{msg} {wide_bar} {pos}/{len}");
+    bar.set_message(format!("{name}: examples"));
+    let examples = recipe.collect(&sequences, || bar.inc(1));
+    bar.finish_and_clear();
+    examples
+}
+
+fn run_fit(settings: &Fit, examples: &Examples, name: &str) -> LinkModel {
+    let mut mean = f64::NAN;
+    let bar = bar(0, "{msg} {wide_bar} {pos}/{len} {eta}");
+    let model = fit(examples, settings, |p| {
+        bar.set_length(p.steps as u64);
+        mean = if mean.is_nan() { p.loss } else { mean + 0.02 * (p.loss - mean) };
+        bar.set_message(format!("{name}: cross-entropy {mean:.4}"));
+        bar.set_position(p.step as u64);
+    });
+    bar.finish_and_clear();
+    println!("{name}: cross-entropy of the last batches {mean:.4}");
+    model
+}
+
+/// A bar on a terminal, nothing elsewhere.
+fn bar(length: u64, form: &str) -> ProgressBar {
+    let style = ProgressStyle::with_template(form).unwrap_or_else(|_| ProgressStyle::default_bar());
+    ProgressBar::new(length).with_style(style)
+}
+
+/// Pairs and tracks of a sequence under a network that has not seen it.
+fn score(model: &LinkModel, source: &Source, second_half: &[String]) -> Result<Unseen> {
+    let labelled = &source.labelled;
+    let half = second_half.iter().any(|s| labelled.name.strip_suffix(s).is_some_and(|n| n.ends_with('-')));
+    let length = labelled.frames.len() as u32;
+    let skip = if half { first_half_length(length).min(length) } else { 0 };
+    let mut counted = labelled.clone();
+    counted.frames.drain(..skip as usize);
+    let mut pairs = Examples::default();
+    Teacher::natural().collect(&counted, &mut fastrand::Rng::with_seed(0), &mut pairs);
+    let link = metrics::scores(&logits(model, &pairs), pairs.labels(), pairs.weights());
+
+    let sequence = Sequence {
+        info: SequenceInfo {
+            name: labelled.name.clone(),
+            frame_rate: labelled.frame_rate,
+            length: length - skip,
+            width: labelled.width as u32,
+            height: labelled.height as u32,
+        },
+        detections: counted.frames.iter().map(|f| f.detections.clone()).collect(),
+    };
+    let mut scorer = GruScorer::new(model.clone());
+    let links = |request: &_| {
+        let mut links = vec![];
+        scorer.score(request, &mut links);
+        Ok::<_, Infallible>(links)
+    };
+    let rows = replay(&sequence, &TrackerConfig::default(), |_| vec![], links)?;
+    let file = source.folder.join("gt/gt.txt");
+    let text = fs::read_to_string(&file).with_context(|| format!("cannot read {}", file.display()))?;
+    let mut truth = parse_truth(&text, Some(length)).with_context(|| file.display().to_string())?;
+    if half {
+        truth = crate::mot::second_half(&truth, length);
+    }
+    let tracks = evaluate(&truth, &rows, length - skip, Benchmark::of(&labelled.name, &truth))
+        .with_context(|| labelled.name.clone())?;
+    Ok(Unseen {
+        sequence: labelled.name.clone(),
+        second_half: half,
+        pairs: pairs.len(),
+        auc: link.auc,
+        loss: link.loss,
+        calibration_error: link.calibration_error,
+        hota: 100.0 * tracks.hota.hota(),
+        mota: 100.0 * tracks.clear.mota(),
+        idf1: 100.0 * tracks.identity.idf1(),
+        id_switches: tracks.clear.idsw,
+    })
+}
+
+fn describe(fit: &Fit, recipe: &Recipe) -> Vec<(String, String)> {
+    let Recipe { teacher, variants, seed, .. } = recipe;
+    let rows = [
+        ("seed", seed.to_string()),
+        ("epochs", fit.epochs.to_string()),
+        ("batch", fit.batch.to_string()),
+        ("optimiser", format!("Adam, peak {}, warm-up {}, cosine to 0", fit.rate, fit.warm_up)),
+        ("copies of a sequence", variants.len().to_string()),
+        ("drop bursts", format!("{} a frame, {} s U^2", teacher.burst_chance, teacher.burst_longest)),
+        ("easy positives kept", teacher.keep_easy.to_string()),
+        ("far negatives kept", teacher.keep_far.to_string()),
+        ("weight", format!("sqrt(min(1 / kept, {}))", teacher.max_weight)),
+    ];
+    rows.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
+}
+
+fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    fs::write(path, bytes).with_context(|| format!("cannot write {}", path.display()))
+}

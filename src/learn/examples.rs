@@ -1,0 +1,141 @@
+//! Labelled pairs, in columns: link requests joined to the truth.
+
+use crate::track::{CANDIDATE_FEATURES, HISTORY, LinkRequest, STEP_FEATURES};
+
+/// A growing set of labelled pairs with raw features.
+///
+/// Histories are stored once a track and frame, as in [`LinkRequest`]; examples refer to them.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Examples {
+    histories: Vec<f32>,
+    lengths: Vec<u8>,
+    candidates: Vec<f32>,
+    track: Vec<u32>,
+    labels: Vec<f32>,
+    weights: Vec<f32>,
+}
+
+impl Examples {
+    /// Number of examples.
+    pub fn len(&self) -> usize {
+        self.labels.len()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.labels.is_empty()
+    }
+
+    /// Share of positives.
+    pub fn positive_share(&self) -> f64 {
+        self.labels.iter().map(|l| f64::from(*l)).sum::<f64>() / self.len().max(1) as f64
+    }
+
+    /// Adds the pairs of `request` that `judge` wants: for each pair index `Some((label, weight))`
+    /// to take it, `None` to leave it. Only the histories that are needed are copied.
+    pub fn push(&mut self, request: &LinkRequest, mut judge: impl FnMut(usize) -> Option<(bool, f32)>) {
+        let mut stored: Vec<Option<u32>> = vec![None; request.tracks()];
+        for (i, pair) in request.pairs.iter().enumerate() {
+            let Some((label, weight)) = judge(i) else { continue };
+            let row = pair.track as usize;
+            let track = *stored[row].get_or_insert_with(|| {
+                let width = HISTORY * STEP_FEATURES;
+                self.histories.extend_from_slice(&request.histories[row * width..(row + 1) * width]);
+                self.lengths.push(request.lengths[row].clamp(1, HISTORY as i32) as u8);
+                (self.lengths.len() - 1) as u32
+            });
+            self.track.push(track);
+            let width = CANDIDATE_FEATURES;
+            self.candidates.extend_from_slice(&request.candidates[i * width..(i + 1) * width]);
+            self.labels.push(if label { 1.0 } else { 0.0 });
+            self.weights.push(weight);
+        }
+    }
+
+    /// Appends all of `other`.
+    pub fn append(&mut self, other: &Examples) {
+        let first = self.lengths.len() as u32;
+        self.histories.extend_from_slice(&other.histories);
+        self.lengths.extend_from_slice(&other.lengths);
+        self.candidates.extend_from_slice(&other.candidates);
+        self.track.extend(other.track.iter().map(|t| t + first));
+        self.labels.extend_from_slice(&other.labels);
+        self.weights.extend_from_slice(&other.weights);
+    }
+
+    /// A random choice of `count` examples, in their order; all of them when there are fewer.
+    pub fn choose(&self, count: usize, rng: &mut fastrand::Rng) -> Examples {
+        let mut chosen = Examples::default();
+        let mut moved: Vec<Option<u32>> = vec![None; self.lengths.len()];
+        let mut wanted = count.min(self.len());
+        for i in 0..self.len() {
+            // Knuth's selection sampling: the share still wanted of those still to come.
+            if rng.usize(..self.len() - i) >= wanted {
+                continue;
+            }
+            wanted -= 1;
+            let track = self.track[i] as usize;
+            let to = *moved[track].get_or_insert_with(|| {
+                let width = HISTORY * STEP_FEATURES;
+                let rows = &self.histories[track * width..(track + 1) * width];
+                chosen.histories.extend_from_slice(rows);
+                chosen.lengths.push(self.lengths[track]);
+                (chosen.lengths.len() - 1) as u32
+            });
+            chosen.track.push(to);
+            chosen.candidates.extend_from_slice(self.sequence(i as u32).1);
+            chosen.labels.push(self.labels[i]);
+            chosen.weights.push(self.weights[i]);
+        }
+        chosen
+    }
+
+    /// History rows `[length, STEP_FEATURES]` and candidate `[CANDIDATE_FEATURES]` of example `i`.
+    pub fn sequence(&self, i: u32) -> (&[f32], &[f32]) {
+        let (i, track) = (i as usize, self.track[i as usize] as usize);
+        let start = track * HISTORY * STEP_FEATURES;
+        let history = &self.histories[start..start + usize::from(self.lengths[track]) * STEP_FEATURES];
+        (history, &self.candidates[i * CANDIDATE_FEATURES..(i + 1) * CANDIDATE_FEATURES])
+    }
+
+    /// (label, weight) of example `i`.
+    pub fn target(&self, i: u32) -> (f32, f32) {
+        (self.labels[i as usize], self.weights[i as usize])
+    }
+
+    /// Labels of all examples.
+    pub fn labels(&self) -> &[f32] {
+        &self.labels
+    }
+
+    /// Weights of all examples.
+    pub fn weights(&self) -> &[f32] {
+        &self.weights
+    }
+
+    /// Valid history steps of all stored tracks, `STEP_FEATURES` wide each.
+    pub fn history_steps(&self) -> impl Iterator<Item = &[f32]> {
+        self.histories.chunks_exact(HISTORY * STEP_FEATURES).zip(&self.lengths).flat_map(|(rows, length)| {
+            rows[..usize::from(*length) * STEP_FEATURES].chunks_exact(STEP_FEATURES)
+        })
+    }
+
+    /// Candidates of all examples, `CANDIDATE_FEATURES` wide each.
+    pub fn candidates(&self) -> impl Iterator<Item = &[f32]> {
+        self.candidates.chunks_exact(CANDIDATE_FEATURES)
+    }
+
+    /// Applies `history` to every valid history step and `candidate` to every candidate, in place.
+    pub(super) fn map_inputs(
+        &mut self,
+        mut history: impl FnMut(&mut [f32]),
+        mut candidate: impl FnMut(&mut [f32]),
+    ) {
+        for (rows, length) in self.histories.chunks_exact_mut(HISTORY * STEP_FEATURES).zip(&self.lengths) {
+            rows[..usize::from(*length) * STEP_FEATURES]
+                .chunks_exact_mut(STEP_FEATURES)
+                .for_each(&mut history);
+        }
+        self.candidates.chunks_exact_mut(CANDIDATE_FEATURES).for_each(&mut candidate);
+    }
+}
