@@ -3,9 +3,10 @@
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-use anyhow::{Context, bail};
+use anyhow::bail;
 use clap::ValueEnum;
 
+use super::signals::Signals;
 use crate::ingest::Transport;
 use crate::ingest::testcam::{Codec, TestCamera, TestCameraConfig};
 
@@ -68,21 +69,11 @@ pub fn run(args: Args) -> anyhow::Result<()> {
     println!("{}", camera.url());
     eprintln!("serving {} frames of {:?}; Ctrl-C ends it", camera.frames(), camera.codec());
 
-    wait_for_signal().context("cannot wait for signals")?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    runtime.block_on(async {
+        Signals::listen()?.next().await;
+        anyhow::Ok(())
+    })?;
     camera.stop();
     Ok(())
-}
-
-/// Until SIGINT or SIGTERM.
-fn wait_for_signal() -> std::io::Result<()> {
-    use tokio::signal::unix::{SignalKind, signal};
-    tokio::runtime::Builder::new_current_thread().enable_all().build()?.block_on(async {
-        let (mut interrupt, mut terminate) =
-            (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
-        tokio::select! {
-            _ = interrupt.recv() => {}
-            _ = terminate.recv() => {}
-        }
-        Ok(())
-    })
 }

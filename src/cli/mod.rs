@@ -9,6 +9,8 @@ pub mod eval;
 mod models;
 #[cfg(feature = "service")]
 pub mod serve;
+#[cfg(any(feature = "service", feature = "testcam"))]
+mod signals;
 #[cfg(feature = "service")]
 pub mod track;
 #[cfg(feature = "learn")]

@@ -7,10 +7,10 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
 use tokio::net::TcpListener;
-use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::oneshot;
 
 use super::models::ModelArgs;
+use super::signals::Signals;
 use crate::api::{self, ApiConfig, NewCamera};
 use crate::config::{Config, TrackerOptions};
 use crate::infer::Models;
@@ -196,27 +196,6 @@ async fn start(plan: Plan) -> Result<Service> {
         readiness: Arc::new(Vec::new),
     };
     Ok(Service { listener, config, set })
-}
-
-/// SIGTERM and SIGINT.
-struct Signals {
-    term: Signal,
-    int: Signal,
-}
-
-impl Signals {
-    fn listen() -> Result<Self> {
-        let listen = |kind| signal(kind).context("cannot listen for signals");
-        Ok(Self { term: listen(SignalKind::terminate())?, int: listen(SignalKind::interrupt())? })
-    }
-
-    /// Resolves at the next one. Cancel safe.
-    async fn next(&mut self) {
-        tokio::select! {
-            _ = self.term.recv() => {}
-            _ = self.int.recv() => {}
-        }
-    }
 }
 
 /// The value of --camera; errors repeat nothing of the URL.

@@ -6,6 +6,7 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 use anyhow::{Context, Result, bail};
 use tokio::sync::mpsc;
 
+use super::super::signals::Signals;
 use super::{Job, Output, progress};
 use crate::api::Picture;
 use crate::infer::Models;
@@ -74,10 +75,10 @@ async fn run(
     let (mut frames, start) = (0u64, Instant::now());
     let mut failure = None;
     // One listener for the whole run: a signal that comes while a picture is drawn counts as well.
-    let mut interrupt = std::pin::pin!(tokio::signal::ctrl_c());
+    let mut signals = Signals::listen()?;
     loop {
         let picture = tokio::select! {
-            _ = &mut interrupt => None,
+            () = signals.next() => None,
             picture = tracked.recv() => picture,
         };
         let Some(picture) = picture else { break };
