@@ -7,6 +7,7 @@ use std::thread;
 use std::time::Duration;
 
 use gakp::ingest::testcam::{TestCamera, TestCameraConfig};
+use jiff::Timestamp;
 use tokio_tungstenite::tungstenite::{self, Message};
 
 use super::support::*;
@@ -19,6 +20,8 @@ struct Ledger {
     epochs: BTreeMap<String, u64>,
     reports: u64,
     missed: u64,
+    /// The age of the oldest report when it was read, seconds.
+    oldest: f64,
 }
 
 impl Ledger {
@@ -37,6 +40,8 @@ impl Ledger {
             self.missed += last - first + 1;
         } else {
             self.reports += 1;
+            let captured: Timestamp = message["capture_ts"].as_str().unwrap().parse().unwrap();
+            self.oldest = self.oldest.max(Timestamp::now().duration_since(captured).as_secs_f64());
         }
         // The first report tells where this subscriber began.
         let expected = self.next.insert(camera, last + 1).unwrap_or(first);
@@ -163,6 +168,8 @@ fn every_frame_is_accounted_for_and_every_hole_announced() {
     service.post("/v1/cameras", &serde_json::json!({"id": "last", "url": "test:?fps=5"}));
     let (healthy, how) = healthy.join().unwrap();
     assert_eq!((how, healthy.missed), (Ended::Enough, 0), "{healthy:?}");
+    // The newest frame wins: a camera that sends too much does not make what is tracked older.
+    assert!(healthy.oldest < 5.0, "a report was {} s old", healthy.oldest);
     for (name, [_, tracked, _]) in names.iter().zip(settled) {
         assert_eq!(healthy.next[*name], tracked, "every tracked frame of {name} was published");
     }

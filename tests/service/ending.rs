@@ -11,10 +11,11 @@ fn sigterm_drains_and_ends_with_0_whatever_the_cameras_do() {
     let Some(clip) = clip() else { return };
     let (live, frozen) = (CameraProcess::start(&clip, &[]), CameraProcess::start(&clip, &[]));
     let state = tempfile::tempdir().unwrap();
+    let refusing = Refusing::start();
     let cameras = [
         format!("live={}", live.url),
         format!("frozen={}", frozen.url),
-        format!("refusing=rtsp://{}/live", refusing_address()),
+        format!("refusing=rtsp://{}/live", refusing.address()),
         format!("mute=rtsp://{}/live", strange_server(b"")),
         "generated=test:?fps=5".to_owned(),
     ];

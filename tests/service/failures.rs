@@ -33,10 +33,11 @@ fn a_failing_camera_is_told_and_retried_and_leaves_the_others_alone() {
     let steady = CameraProcess::start(&clip, &[]);
     let mut shaky = CameraProcess::start(&clip, &[]);
     let state = tempfile::tempdir().unwrap();
+    let refusing = Refusing::start();
     let cameras = [
         format!("steady={}", steady.url),
         format!("shaky={}", shaky.url),
-        format!("refusing=rtsp://{}/live", refusing_address()),
+        format!("refusing=rtsp://{}/live", refusing.address()),
         format!("rubbish=rtsp://{}/live", strange_server(b"220 mail.example ESMTP\r\n\r\n")),
         format!("mute=rtsp://{}/live", strange_server(b"")),
         format!("astray={}-not", steady.url),

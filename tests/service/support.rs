@@ -52,15 +52,23 @@ pub const CLIP_FRAMES: usize = 120;
 pub fn clip() -> Option<PathBuf> {
     static CLIP: OnceLock<PathBuf> = OnceLock::new();
     let film = film()?;
-    Some(CLIP.get_or_init(|| cut(&film, "people.mp4", CLIP_FRAMES)).clone())
+    let clip = CLIP.get_or_init(|| {
+        let folder = Path::new(env!("CARGO_TARGET_TMPDIR"));
+        let (part, clip) = (folder.join(format!("{}.mp4", std::process::id())), folder.join("people.mp4"));
+        cut(&film, &part, CLIP_FRAMES);
+        // Another test binary may have it open: it keeps the file that it opened.
+        std::fs::rename(part, &clip).unwrap();
+        clip
+    });
+    Some(clip.clone())
 }
 
-fn cut(film: &Path, name: &str, frames: usize) -> PathBuf {
-    let made = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("{}-{name}", std::process::id()));
+/// Writes the first frames of a film to `part`.
+fn cut(film: &Path, part: &Path, frames: usize) {
     let mut spec = SourceSpec::parse(film.to_str().unwrap()).unwrap();
     spec.pacing = Pacing::AsFastAsPossible;
     let (done, wait) = mpsc::sync_channel(1);
-    let (mut writer, mut left, path) = (None::<VideoWriter>, frames, made.clone());
+    let (mut writer, mut left, path) = (None::<VideoWriter>, frames, part.to_owned());
     let source = gakp::ingest::start(&CameraId::new("film").unwrap(), spec, move |event| {
         let SourceEvent::Frame(frame) = event else { return ControlFlow::Continue(()) };
         let image = frame.image;
@@ -78,7 +86,6 @@ fn cut(film: &Path, name: &str, frames: usize) -> PathBuf {
     });
     wait.recv_timeout(PATIENCE).expect("the clip").unwrap().finish().unwrap();
     source.unwrap().stop();
-    made
 }
 
 /// Waits until `so` gives something.
@@ -455,9 +462,19 @@ impl Socket {
     }
 }
 
-/// A port that refuses: it was free a moment ago and nothing listens there.
-pub fn refusing_address() -> SocketAddr {
-    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
+/// A port that refuses: it is taken, but nothing listens there.
+pub struct Refusing(RawSocket);
+
+impl Refusing {
+    pub fn start() -> Self {
+        let socket = RawSocket::new(Domain::IPV4, Type::STREAM, None).unwrap();
+        socket.bind(&SocketAddr::from(([127, 0, 0, 1], 0)).into()).unwrap();
+        Self(socket)
+    }
+
+    pub fn address(&self) -> SocketAddr {
+        self.0.local_addr().unwrap().as_socket().unwrap()
+    }
 }
 
 /// Takes connections and answers whatever comes with `answer`, or never when it is empty.

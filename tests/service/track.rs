@@ -7,6 +7,7 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::process::Output;
 use std::sync::mpsc;
+use std::time::Duration;
 
 use gakp::ingest::{Pacing, SourceEvent, SourceSpec};
 use gakp::mot::{Row, parse_results};
@@ -82,6 +83,28 @@ fn a_video_gives_the_same_rows_every_time_and_an_annotated_copy() {
     let part = fs::read(path("part.txt")).unwrap();
     assert!(!part.is_empty() && first.starts_with(&part), "the first frames' rows");
     assert!(parse_results(std::str::from_utf8(&part).unwrap(), Some(30)).is_ok());
+}
+
+/// A live camera has no end: a signal ends the run, and what was written is complete.
+#[test]
+fn a_signal_ends_the_tracking_of_a_live_camera() {
+    let Some(clip) = clip() else { return };
+    let camera = CameraProcess::start(&clip, &[]);
+    let folder = tempfile::tempdir().unwrap();
+    for signal in ["INT", "TERM"] {
+        let path = |kind: &str| folder.path().join(format!("{signal}.{kind}"));
+        let (out, copy) = (path("txt"), path("mp4"));
+        let args = ["--out", out.to_str().unwrap(), "--video", copy.to_str().unwrap()];
+        let mut process = Process::start(&[&["track", &camera.url], &args[..]].concat());
+        // The copy gets its first bytes late; the rows' file is there once a frame was tracked.
+        eventually("the first frame", || out.exists().then_some(()));
+        std::thread::sleep(Duration::from_secs(1));
+        process.signal(signal);
+        assert_eq!(process.wait().code(), Some(0), "{}", process.log());
+        let (frames, size) = decoded(&copy);
+        assert!(frames > 0 && size == (768, 576), "{frames} of {size:?}");
+        assert!(rows(&out, 10 * CLIP_FRAMES).iter().all(|row| row.bbox.is_valid()));
+    }
 }
 
 /// A sequence of two people who walk past each other, seen in every frame.
