@@ -414,7 +414,10 @@ impl<S: FnMut(SourceEvent) -> ControlFlow<()>> Source<S> {
                 CaptureTime { unix_ns: time.0, clock: Clock::Media }
             }
             Some(unix_ns) => CaptureTime { unix_ns, clock: Clock::Rtcp },
-            None => CaptureTime { unix_ns: wall - decoding.as_nanos() as i64, clock: Clock::Arrival },
+            None => CaptureTime {
+                unix_ns: flow.in_order(wall - decoding.as_nanos() as i64),
+                clock: Clock::Arrival,
+            },
         };
         let delivered = (self.sink)(SourceEvent::Frame(RawFrame { image, time, capture, decoded }));
         // A sink that blocks is no silence of the source.
@@ -451,16 +454,26 @@ struct Flow {
     first: Option<Instant>,
     last: Option<Instant>,
     frames: u64,
+    /// Arrival of the last frame, Unix nanoseconds.
+    arrived: i64,
     caps: Option<(gst::Caps, gst_video::VideoInfo)>,
 }
 
 impl Default for Flow {
     fn default() -> Self {
-        Self { opened: Instant::now(), first: None, last: None, frames: 0, caps: None }
+        Self { opened: Instant::now(), first: None, last: None, frames: 0, arrived: 0, caps: None }
     }
 }
 
 impl Flow {
+    /// A stream with B-frames brings a frame before those that are shown, and delivered, ahead of it:
+    /// it cannot have been captured before them. A wall clock that was set back is followed.
+    fn in_order(&mut self, arrived: i64) -> i64 {
+        let behind = self.arrived - arrived;
+        self.arrived = if (0..1_000_000_000).contains(&behind) { self.arrived } else { arrived };
+        self.arrived
+    }
+
     /// The picture's format; the caps change when a camera changes its resolution.
     fn info(&mut self, sample: &gst::Sample) -> Option<gst_video::VideoInfo> {
         let caps = sample.caps_owned()?;

@@ -43,8 +43,8 @@ impl Ledger {
         assert_eq!(first, expected, "a hole that was not announced, or something twice: {message}");
     }
 
-    /// Reads until `enough`, with a rest after every message.
-    fn read(mut self, mut socket: Socket, rest: Duration, enough: impl Fn(&Self) -> bool) -> (Self, Ended) {
+    /// Reads until `enough`, which is asked before every message.
+    fn read(mut self, mut socket: Socket, enough: impl Fn(&Self) -> bool) -> (Self, Ended) {
         while !enough(&self) {
             match socket.message() {
                 Ok(Message::Close(_)) => return (self, Ended::ByService),
@@ -54,7 +54,6 @@ impl Ledger {
                 }
                 Err(_) => return (self, Ended::ByService),
             }
-            thread::sleep(rest);
         }
         (self, Ended::Enough)
     }
@@ -80,28 +79,30 @@ fn every_frame_is_accounted_for_and_every_hole_announced() {
     let names = ["gate", "burst-1", "burst-2"];
     let cameras = [gate.url.clone(), burst.url(), burst.url()];
     let cameras: Vec<_> = names.iter().zip(cameras).map(|(name, url)| format!("{name}={url}")).collect();
-    let mut args = vec!["--threads", "1", "--detector-size", "192x160"];
+    let mut args = vec!["--threads", "1", "--detector-size", "320x256"];
     cameras.iter().for_each(|camera| args.extend(["--camera", camera]));
     let service = Service::start(&folder.path().join("state"), &args);
     for name in names {
         service.wait_for_frames(name, 1);
     }
 
-    let mut mute = service.narrow_socket("/v1/tracks");
-    let slow = service.narrow_socket("/v1/tracks");
     let healthy = service.socket("/v1/tracks");
-    // The first message is taken here, so that all have begun.
-    let mut mutes = Ledger::default();
-    mutes.take(&mute.message().unwrap());
-    let slow = thread::spawn(move || {
-        Ledger::default().read(slow, Duration::from_millis(50), |ledger| ledger.missed > 0)
-    });
     let all_told = Arc::new(AtomicBool::new(false));
     let told = all_told.clone();
-    let healthy = thread::spawn(move || {
-        Ledger::default().read(healthy, Duration::ZERO, |_| told.load(Ordering::Relaxed))
-    });
+    let healthy = thread::spawn(move || Ledger::default().read(healthy, |_| told.load(Ordering::Relaxed)));
 
+    // A slow subscriber: four messages a second, until its ring has overflowed; then it catches up.
+    let slow = service.narrow_socket("/v1/tracks");
+    let hurry = Arc::new(AtomicBool::new(false));
+    let hurried = hurry.clone();
+    let slow = thread::spawn(move || {
+        Ledger::default().read(slow, |ledger| {
+            if !hurried.load(Ordering::Relaxed) {
+                thread::sleep(Duration::from_millis(250));
+            }
+            ledger.missed > 0
+        })
+    });
     for _ in 0..2 {
         gate.kill();
         let lost = service.wait_for_state("gate", "retrying");
@@ -110,12 +111,19 @@ fn every_frame_is_accounted_for_and_every_hole_announced() {
         service.wait_for_state("gate", "live");
         service.wait_for_frames("gate", 5);
     }
-    // The slow one has lost something by now or will soon: its ring is full.
+    let overflowed = || service.metrics().get("gakp_hub_reports_dropped_total");
+    eventually("the slow one to lose something", || (overflowed() > 0.0).then_some(()));
+    hurry.store(true, Ordering::Relaxed);
     let (slow, how) = slow.join().unwrap();
-    assert_eq!(how, Ended::Enough, "the slow one reads, so it is not cut off: {slow:?}");
-    // The mute one reads at last, or was given up meanwhile; what it got has no silent hole.
-    let (mutes, how) = mutes.read(mute, Duration::ZERO, |ledger| ledger.missed > 0);
-    assert!(mutes.missed > 0 || how == Ended::ByService, "{mutes:?}");
+    assert_eq!(how, Ended::Enough, "who reads, though slowly, is not cut off: {slow:?}");
+
+    // One that reads nothing at all until it has lost something. It is told, or it was cut off; what
+    // it got has no silent hole either way.
+    let before = overflowed();
+    let mute = service.narrow_socket("/v1/tracks");
+    eventually("the mute one to lose something", || (overflowed() > before).then_some(()));
+    let (mute, how) = Ledger::default().read(mute, |ledger| ledger.missed > 0);
+    assert!(mute.missed > 0 || how == Ended::ByService, "{mute:?}");
 
     // No camera any more: what is in flight is finished, and then every account is balanced.
     gate.kill();
