@@ -76,6 +76,12 @@ pub fn run(cli: Cli) -> anyhow::Result<()> {
 
 /// Logs go to standard error; what a command prints goes to standard output.
 fn start_log(level: &str, json: bool) -> anyhow::Result<()> {
+    // A word that is no level would be taken as a module's name, and all else would fall silent.
+    let levels = level.split(',').filter(|part| !part.contains(['=', '[']));
+    for word in levels.map(str::trim) {
+        let known = word.parse::<tracing_subscriber::filter::LevelFilter>().is_ok();
+        anyhow::ensure!(known, "--log {level:?}: {word:?} is none of off, error, warn, info, debug, trace");
+    }
     // ONNX Runtime tells every step of its optimiser; say `ort=info` to hear it.
     let filter = tracing_subscriber::EnvFilter::try_new(format!("ort=warn,{level}"))
         .map_err(|e| anyhow::anyhow!("--log {level:?}: {e}; use error, warn, info, debug or trace"))?;

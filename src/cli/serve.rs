@@ -7,7 +7,8 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
 use tokio::net::TcpListener;
-use tokio::signal::unix::{SignalKind, signal};
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::sync::oneshot;
 
 use super::models::ModelArgs;
 use crate::api::{self, ApiConfig, NewCamera};
@@ -23,7 +24,8 @@ use crate::types::CameraId;
 ///
 /// Cameras come from the configuration, from --camera, and at run time from POST /v1/cameras; the
 /// latter are remembered in the state folder. SIGTERM drains and ends; a second one ends at once.
-#[derive(Clone, Debug, clap::Args)]
+// No `Debug`: the cameras may hold passwords.
+#[derive(Clone, clap::Args)]
 pub struct Args {
     /// Configuration file (TOML).
     #[arg(long, short, value_name = "FILE")]
@@ -32,8 +34,9 @@ pub struct Args {
     #[arg(long, env = "GAKP_LISTEN", value_name = "ADDR")]
     listen: Option<SocketAddr>,
     /// A camera, as NAME=URL: rtsp://, rtsps://, http(s)://, a file, v4l2:///dev/video0, test:. Repeatable.
-    #[arg(long = "camera", value_name = "NAME=URL", value_parser = camera)]
-    cameras: Vec<NewCamera>,
+    // Taken apart later: clap's own errors would repeat the value, and with it a password.
+    #[arg(long = "camera", value_name = "NAME=URL")]
+    cameras: Vec<String>,
     /// Play files given with --camera over and over.
     #[arg(long = "loop")]
     looped: bool,
@@ -48,7 +51,7 @@ pub struct Args {
     models: ModelArgs,
 }
 
-/// How long draining may take before the service ends anyway.
+/// How long draining may take, from the first signal on, before the service ends anyway.
 const DRAIN: Duration = Duration::from_millis(4500);
 
 /// Runs the service until it is told to end.
@@ -83,11 +86,12 @@ impl Plan {
     fn new(args: Args) -> Result<Self> {
         let config = args.config.as_deref().map(Config::read).transpose()?.unwrap_or_default();
         let mut cameras = config.cameras;
-        for camera in args.cameras {
+        for text in &args.cameras {
+            let camera = camera(text, args.looped)?;
             if cameras.iter().any(|c| c.id == camera.id) {
                 bail!("two cameras are named {:?}: names must differ", camera.id.as_str());
             }
-            cameras.push(NewCamera { looped: args.looped, ..camera });
+            cameras.push(camera);
         }
         for camera in &cameras {
             source_spec(camera)
@@ -116,21 +120,62 @@ impl Plan {
 }
 
 async fn serve(plan: Plan) -> Result<()> {
-    let mut ended = Ended::listen()?;
+    let mut signals = Signals::listen()?;
+    let (stop, stopped) = oneshot::channel();
+    let mut service = std::pin::pin!(async {
+        let Service { listener, config, set } = start(plan).await?;
+        let hub = config.hub.clone();
+        let served = api::serve(listener, config, async {
+            // An error means that nobody can ask for the end any more: that is the end too.
+            let _ = stopped.await;
+        })
+        .await;
+        hub.close();
+        set.shutdown().await;
+        served.context("the HTTP server failed")
+    });
+    tokio::select! {
+        ended = &mut service => return ended,
+        () = signals.next() => tracing::info!("draining"),
+    }
+    // While it still starts, this ends it as soon as it has started.
+    let _ = stop.send(());
+    tokio::select! {
+        drained = tokio::time::timeout(DRAIN, &mut service) => match drained {
+            Ok(ended) => return ended,
+            Err(_) => tracing::warn!("draining took too long; ending anyway"),
+        },
+        () = signals.next() => tracing::warn!("told twice; ending at once"),
+    }
+    Ok(())
+}
+
+/// What runs once everything was checked.
+struct Service {
+    listener: TcpListener,
+    config: ApiConfig,
+    set: Arc<CameraSet>,
+}
+
+/// Loads the models, takes the port, starts the cameras: in this order, so that a mistake leaves
+/// nothing half-started.
+async fn start(plan: Plan) -> Result<Service> {
     let metrics = Metrics::new().context("cannot set up the metrics")?;
     // Loading models takes seconds on a GPU and blocks.
     let (settings, observer) = (plan.models, metrics.clone());
     let models = tokio::task::spawn_blocking(move || Models::load(&settings, observer)).await??;
     metrics.provider(models.report.provider);
     let tracker = plan.tracker.apply(models.calibrate(TrackerConfig::default()))?;
+    let hub = Hub::new(HubConfig::default(), models.detector.classes().into());
+    hub.metrics().register(metrics.registry())?;
+    let lanes = Lanes::start(models, metrics.clone())?;
     let listener = TcpListener::bind(plan.listen)
         .await
         .with_context(|| format!("cannot listen on {}: choose another address with --listen", plan.listen))?;
     let address = listener.local_addr()?;
-    let hub = Hub::new(HubConfig::default(), models.detector.classes().into());
-    hub.metrics().register(metrics.registry())?;
+    plan.store.0.make_folder()?;
     let set = CameraSet::new(SetConfig {
-        lanes: Lanes::start(models, metrics.clone())?,
+        lanes,
         hub: hub.clone(),
         metrics: metrics.clone(),
         tracker,
@@ -145,57 +190,44 @@ async fn serve(plan: Plan) -> Result<()> {
     tracing::info!("the page is at http://{address}/");
     let config = ApiConfig {
         cameras: set.clone(),
-        hub: hub.clone(),
+        hub,
         registry: metrics.registry().clone(),
         // Models are warm before the port is bound: who can ask finds the service ready.
         readiness: Arc::new(Vec::new),
     };
-    let served = api::serve(listener, config, ended.once()).await;
-    tracing::info!("draining");
-    let drain = async {
-        hub.close();
-        set.shutdown().await;
-    };
-    tokio::select! {
-        drained = tokio::time::timeout(DRAIN, drain) => {
-            if drained.is_err() {
-                tracing::warn!("draining took too long; ending anyway");
-            }
-        }
-        () = ended.again() => tracing::warn!("told twice; ending at once"),
-    }
-    served.context("the HTTP server failed")
+    Ok(Service { listener, config, set })
 }
 
 /// SIGTERM and SIGINT.
-struct Ended {
-    term: tokio::signal::unix::Signal,
-    int: tokio::signal::unix::Signal,
+struct Signals {
+    term: Signal,
+    int: Signal,
 }
 
-impl Ended {
+impl Signals {
     fn listen() -> Result<Self> {
         let listen = |kind| signal(kind).context("cannot listen for signals");
         Ok(Self { term: listen(SignalKind::terminate())?, int: listen(SignalKind::interrupt())? })
     }
 
-    async fn again(&mut self) {
+    /// Resolves at the next one. Cancel safe.
+    async fn next(&mut self) {
         tokio::select! {
             _ = self.term.recv() => {}
             _ = self.int.recv() => {}
         }
     }
-
-    /// Resolves at the first signal.
-    async fn once(&mut self) {
-        self.again().await;
-    }
 }
 
-fn camera(text: &str) -> Result<NewCamera, String> {
-    let (id, url) = text.split_once('=').ok_or("write NAME=URL, such as gate=rtsp://10.0.0.2/stream1")?;
-    let id = CameraId::new(id).map_err(|e| e.to_string())?;
-    Ok(NewCamera { id, url: url.into(), transport: None, looped: false })
+/// The value of --camera; errors repeat nothing of the URL.
+fn camera(text: &str, looped: bool) -> Result<NewCamera> {
+    let (id, url) = text
+        .split_once('=')
+        // The first `=` of a URL alone is within it, maybe behind its password.
+        .filter(|(id, _)| !id.contains("://"))
+        .context("--camera needs NAME=URL, such as gate=rtsp://10.0.0.2/stream1: the name is missing")?;
+    let id = CameraId::new(id).context("--camera NAME=URL: wrong name")?;
+    Ok(NewCamera { id, url: url.into(), transport: None, looped })
 }
 
 fn default_state_dir() -> Option<PathBuf> {

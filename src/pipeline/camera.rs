@@ -212,6 +212,7 @@ impl Camera {
             index: 0,
             last_decoded: None,
             opened_before: false,
+            lost: false,
         };
         let source = match ingest::start(&id, spec, sink.into_fn()) {
             Ok(source) => source,
@@ -259,6 +260,8 @@ struct Sink {
     index: u64,
     last_decoded: Option<Instant>,
     opened_before: bool,
+    /// Since it was last opened. A file that begins again is opened anew without having been lost.
+    lost: bool,
 }
 
 impl Sink {
@@ -270,7 +273,8 @@ impl Sink {
         let id = &self.view.id;
         match event {
             SourceEvent::Opened(opened) => {
-                if std::mem::replace(&mut self.opened_before, true) {
+                let lost = std::mem::replace(&mut self.lost, false);
+                if std::mem::replace(&mut self.opened_before, true) && lost {
                     self.view.metrics.reconnects.inc();
                 }
                 self.last_decoded = None;
@@ -292,6 +296,7 @@ impl Sink {
                 }
             }
             SourceEvent::Lost { reason, retry_in } => {
+                self.lost = true;
                 self.all.camera_failed(id, reason.label());
                 self.view.change(|c| {
                     c.state = if retry_in.is_some() { CameraState::Retrying } else { CameraState::Failed };

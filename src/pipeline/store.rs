@@ -48,24 +48,32 @@ pub enum StoreError {
 }
 
 impl Store {
-    /// Opens (and makes) the folder and reads what it remembers.
+    /// Reads what the folder remembers; one that is not there yet remembers nothing.
     ///
     /// # Errors
     /// [`StoreError`]; a damaged file is never overwritten.
     pub fn open(folder: &Path) -> Result<(Self, Remembered), StoreError> {
-        let io = |verb, path: &Path| {
-            let path = path.to_path_buf();
-            move |source| StoreError::Io { verb, path, source }
-        };
-        fs::create_dir_all(folder).map_err(io("make the folder", folder))?;
         let path = folder.join("cameras.json");
         let remembered = match fs::read_to_string(&path) {
             Ok(text) => serde_json::from_str(&text)
                 .map_err(|reason| StoreError::Damaged { path: path.clone(), reason })?,
             Err(error) if error.kind() == io::ErrorKind::NotFound => Remembered::default(),
-            Err(error) => return Err(io("read", &path)(error)),
+            Err(source) => return Err(StoreError::Io { verb: "read", path, source }),
         };
         Ok((Self { path }, remembered))
+    }
+
+    /// Makes the folder, if it is not there.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`].
+    pub fn make_folder(&self) -> Result<(), StoreError> {
+        let folder = self.path.parent().unwrap_or(&self.path);
+        fs::create_dir_all(folder).map_err(|source| StoreError::Io {
+            verb: "make the folder",
+            path: folder.to_path_buf(),
+            source,
+        })
     }
 
     /// Writes everything: to a new file that then takes the old one's place, so that a crash leaves
@@ -98,8 +106,11 @@ mod tests {
     #[test]
     fn what_is_saved_comes_back_and_damage_is_told() {
         let folder = tempfile::tempdir().unwrap();
-        let (store, empty) = Store::open(folder.path()).unwrap();
+        let folder = folder.path().join("state");
+        let (store, empty) = Store::open(&folder).unwrap();
         assert_eq!(empty, Remembered::default());
+        assert!(!folder.exists(), "looking leaves no trace");
+        store.make_folder().unwrap();
         let camera = NewCamera {
             id: CameraId::new("gate").unwrap(),
             url: "rtsp://u:p@h/s".into(),
@@ -108,8 +119,8 @@ mod tests {
         };
         let saved = Remembered { epoch: 7, cameras: vec![camera] };
         store.save(&saved).unwrap();
-        assert_eq!(Store::open(folder.path()).unwrap().1, saved);
-        fs::write(folder.path().join("cameras.json"), "{").unwrap();
-        assert!(matches!(Store::open(folder.path()), Err(StoreError::Damaged { .. })));
+        assert_eq!(Store::open(&folder).unwrap().1, saved);
+        fs::write(folder.join("cameras.json"), "{").unwrap();
+        assert!(matches!(Store::open(&folder), Err(StoreError::Damaged { .. })));
     }
 }

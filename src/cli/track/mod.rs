@@ -94,28 +94,52 @@ pub fn run(args: Args) -> Result<()> {
     }
 }
 
-/// Where rows go.
+/// Where rows go. A file is not touched before there is something to write: a mistake in the input
+/// must not cost the rows of an earlier run.
 pub(super) struct Output {
     name: String,
-    file: Box<dyn Write>,
+    path: PathBuf,
+    file: Option<Box<dyn Write>>,
 }
 
 impl Output {
     pub fn create(path: &Path) -> Result<Self> {
-        let name = path.display().to_string();
+        let (name, path) = (path.display().to_string(), path.to_path_buf());
         if name == "-" {
-            return Ok(Self { name: "standard output".into(), file: Box::new(std::io::stdout().lock()) });
+            let file: Box<dyn Write> = Box::new(std::io::stdout().lock());
+            return Ok(Self { name: "standard output".into(), path, file: Some(file) });
         }
-        let file = std::fs::File::create(path).with_context(|| format!("cannot write {name}"))?;
-        Ok(Self { name, file: Box::new(std::io::BufWriter::new(file)) })
+        // What opening it would find out later is told now.
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        if path.is_dir() {
+            bail!("cannot write {name}: it is a folder");
+        }
+        if let Some(folder) = folder.filter(|folder| !folder.is_dir()) {
+            bail!("cannot write {name}: there is no folder {}", folder.display());
+        }
+        Ok(Self { name, path, file: None })
     }
 
     fn write(&mut self, rows: &[crate::mot::Row]) -> Result<()> {
         let text = crate::mot::write_results(rows);
-        self.file.write_all(text.as_bytes()).with_context(|| format!("cannot write {}", self.name))
+        self.open()?.write_all(text.as_bytes()).with_context(|| format!("cannot write {}", self.name))
     }
 
+    /// The end of a run that went well; the file is there even if it has no rows.
     fn finish(&mut self) -> Result<()> {
-        self.file.flush().with_context(|| format!("cannot write {}", self.name))
+        self.open()?.flush().with_context(|| format!("cannot write {}", self.name))
+    }
+
+    fn open(&mut self) -> Result<&mut dyn Write> {
+        let file = match self.file.take() {
+            Some(file) => file,
+            None => {
+                let file = std::fs::File::create(&self.path);
+                Box::new(std::io::BufWriter::new(
+                    file.with_context(|| format!("cannot write {}", self.name))?,
+                ))
+            }
+        };
+        Ok(self.file.insert(file))
     }
 }

@@ -41,9 +41,9 @@ pub fn track(input: &str, job: &Job, out: &mut Output) -> Result<Tracked> {
         .worker_threads(1)
         .enable_all()
         .build()?;
-    let tracked = runtime.block_on(run(spec, models, tracker, metrics, job, out));
+    let tracked = runtime.block_on(run(spec, models, tracker, metrics, job, out))?;
     out.finish()?;
-    tracked
+    Ok(tracked)
 }
 
 async fn run(
@@ -73,10 +73,12 @@ async fn run(
     let mut film = job.video.as_deref().map(Film::new);
     let (mut frames, start) = (0u64, Instant::now());
     let mut failure = None;
+    // One listener for the whole run: a signal that comes while a picture is drawn counts as well.
+    let mut interrupt = std::pin::pin!(tokio::signal::ctrl_c());
     loop {
         let picture = tokio::select! {
+            _ = &mut interrupt => None,
             picture = tracked.recv() => picture,
-            _ = tokio::signal::ctrl_c() => None,
         };
         let Some(picture) = picture else { break };
         let condition = camera.view().condition();

@@ -1,0 +1,162 @@
+//! Every frame is accounted for and every hole is announced, whatever happens at either end.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::Duration;
+
+use gakp::ingest::testcam::{TestCamera, TestCameraConfig};
+use tokio_tungstenite::tungstenite::{self, Message};
+
+use super::support::*;
+
+/// What a subscriber was told: reports and announced holes by camera, in order and without any hole
+/// that was not announced.
+#[derive(Debug, Default)]
+struct Ledger {
+    next: BTreeMap<String, u64>,
+    epochs: BTreeMap<String, u64>,
+    reports: u64,
+    missed: u64,
+}
+
+impl Ledger {
+    fn take(&mut self, message: &Message) {
+        let Message::Text(text) = message else { panic!("not a text message: {message:?}") };
+        let message: serde_json::Value = serde_json::from_str(text).unwrap();
+        let camera = message["camera"].as_str().unwrap().to_owned();
+        let epoch = message["epoch"].as_u64().unwrap();
+        assert_eq!(*self.epochs.entry(camera.clone()).or_insert(epoch), epoch, "{message}");
+        let (first, last) = match message.get("gap") {
+            Some(gap) => (gap["first"].as_u64().unwrap(), gap["last"].as_u64().unwrap()),
+            None => (message["seq"].as_u64().unwrap(), message["seq"].as_u64().unwrap()),
+        };
+        if message.get("gap").is_some() {
+            assert!(message.get("seq").is_none() && last >= first, "{message}");
+            self.missed += last - first + 1;
+        } else {
+            self.reports += 1;
+        }
+        // The first report tells where this subscriber began.
+        let expected = self.next.insert(camera, last + 1).unwrap_or(first);
+        assert_eq!(first, expected, "a hole that was not announced, or something twice: {message}");
+    }
+
+    /// Reads until `enough`, with a rest after every message.
+    fn read(mut self, mut socket: Socket, rest: Duration, enough: impl Fn(&Self) -> bool) -> (Self, Ended) {
+        while !enough(&self) {
+            match socket.message() {
+                Ok(Message::Close(_)) => return (self, Ended::ByService),
+                Ok(message) => self.take(&message),
+                Err(tungstenite::Error::Io(error)) if error.kind() == std::io::ErrorKind::WouldBlock => {
+                    panic!("nothing came for a long time: {self:?}")
+                }
+                Err(_) => return (self, Ended::ByService),
+            }
+            thread::sleep(rest);
+        }
+        (self, Ended::Enough)
+    }
+}
+
+#[derive(Debug, PartialEq)]
+enum Ended {
+    Enough,
+    ByService,
+}
+
+#[test]
+fn every_frame_is_accounted_for_and_every_hole_announced() {
+    let Some(clip) = clip() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    // One camera with people, killed twice; two that send far more than one core detects in.
+    let mut gate = CameraProcess::start(&clip, &[]);
+    let burst = TestCamera::start(TestCameraConfig {
+        fps: Some(240.0),
+        ..TestCameraConfig::new(tiny_clip(folder.path()))
+    })
+    .unwrap();
+    let names = ["gate", "burst-1", "burst-2"];
+    let cameras = [gate.url.clone(), burst.url(), burst.url()];
+    let cameras: Vec<_> = names.iter().zip(cameras).map(|(name, url)| format!("{name}={url}")).collect();
+    let mut args = vec!["--threads", "1", "--detector-size", "192x160"];
+    cameras.iter().for_each(|camera| args.extend(["--camera", camera]));
+    let service = Service::start(&folder.path().join("state"), &args);
+    for name in names {
+        service.wait_for_frames(name, 1);
+    }
+
+    let mut mute = service.narrow_socket("/v1/tracks");
+    let slow = service.narrow_socket("/v1/tracks");
+    let healthy = service.socket("/v1/tracks");
+    // The first message is taken here, so that all have begun.
+    let mut mutes = Ledger::default();
+    mutes.take(&mute.message().unwrap());
+    let slow = thread::spawn(move || {
+        Ledger::default().read(slow, Duration::from_millis(50), |ledger| ledger.missed > 0)
+    });
+    let all_told = Arc::new(AtomicBool::new(false));
+    let told = all_told.clone();
+    let healthy = thread::spawn(move || {
+        Ledger::default().read(healthy, Duration::ZERO, |_| told.load(Ordering::Relaxed))
+    });
+
+    for _ in 0..2 {
+        gate.kill();
+        let lost = service.wait_for_state("gate", "retrying");
+        assert!(lost["last_error"].is_string(), "{lost}");
+        gate.restart();
+        service.wait_for_state("gate", "live");
+        service.wait_for_frames("gate", 5);
+    }
+    // The slow one has lost something by now or will soon: its ring is full.
+    let (slow, how) = slow.join().unwrap();
+    assert_eq!(how, Ended::Enough, "the slow one reads, so it is not cut off: {slow:?}");
+    // The mute one reads at last, or was given up meanwhile; what it got has no silent hole.
+    let (mutes, how) = mutes.read(mute, Duration::ZERO, |ledger| ledger.missed > 0);
+    assert!(mutes.missed > 0 || how == Ended::ByService, "{mutes:?}");
+
+    // No camera any more: what is in flight is finished, and then every account is balanced.
+    gate.kill();
+    burst.stop();
+    for name in names {
+        service.wait_for_state(name, "retrying");
+    }
+    let accounts = |metrics: &Metrics| names.map(|name| metrics.account(name));
+    let balanced = |[frames_in, tracked, dropped]: &[u64; 3]| *frames_in == tracked + dropped;
+    eventually("the accounts to be balanced", || {
+        accounts(&service.metrics()).iter().all(balanced).then_some(())
+    });
+    // It stays so: nothing was late.
+    let settled = accounts(&service.metrics());
+    thread::sleep(Duration::from_millis(500));
+    let metrics = service.metrics();
+    assert_eq!(accounts(&metrics), settled);
+    assert!(settled.iter().all(balanced), "{settled:?}");
+
+    let overload: f64 = names.iter().map(|name| metrics.dropped(name, "overload")).sum();
+    assert!(overload > 0.0, "the test was too gentle: {settled:?}");
+    assert!(metrics.of("gakp_camera_reconnects_total", "gate") >= 2.0);
+    assert!(metrics.get("gakp_hub_reports_dropped_total") > 0.0);
+    for (name, [frames_in, tracked, dropped]) in names.iter().zip(settled) {
+        assert_eq!(metrics.of("gakp_camera_up", name), 0.0);
+        let status = service.camera(name);
+        let sum: u64 = status["dropped"].as_object().unwrap().values().map(|n| n.as_u64().unwrap()).sum();
+        assert_eq!(
+            (&status["frames_in"], &status["tracked"], sum),
+            (&frames_in.into(), &tracked.into(), dropped)
+        );
+    }
+
+    // The healthy one missed nothing and heard the last report of every camera.
+    all_told.store(true, Ordering::Relaxed);
+    // It looks after each message: one more camera gives it one.
+    service.post("/v1/cameras", &serde_json::json!({"id": "last", "url": "test:?fps=5"}));
+    let (healthy, how) = healthy.join().unwrap();
+    assert_eq!((how, healthy.missed), (Ended::Enough, 0), "{healthy:?}");
+    for (name, [_, tracked, _]) in names.iter().zip(settled) {
+        assert_eq!(healthy.next[*name], tracked, "every tracked frame of {name} was published");
+    }
+    service.stop();
+}

@@ -1,0 +1,495 @@
+//! The real binary as a child process, real RTSP cameras, and small blocking clients.
+#![allow(dead_code, reason = "each test binary uses its own part")]
+
+use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Output, Stdio};
+use std::sync::{Arc, Mutex, OnceLock, mpsc};
+use std::time::{Duration, Instant};
+
+use gakp::ingest::{Pacing, Pixels, SourceEvent, SourceSpec, VideoWriter};
+use gakp::types::{CameraId, YuvMatrix, YuvRange};
+use serde_json::Value;
+use socket2::{Domain, Socket as RawSocket, Type};
+use tokio_tungstenite::tungstenite::client::IntoClientRequest;
+use tokio_tungstenite::tungstenite::{self, Message, WebSocket};
+
+/// Long enough for any step on a busy machine; reaching it is a failure.
+pub const PATIENCE: Duration = Duration::from_secs(60);
+
+const GAKP: &str = env!("CARGO_BIN_EXE_gakp");
+
+/// The repository's models; `None`, said loudly, without the set-up. Where the environment has `CI`
+/// that is a failure.
+pub fn models() -> Option<PathBuf> {
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
+    needed(models.join("cache/libonnxruntime.so"), "models").then_some(models)
+}
+
+/// The demo film; `None` as for [`models`].
+pub fn film() -> Option<PathBuf> {
+    let film = models()?.join("cache/vtest.avi");
+    needed(&film, "footage").then_some(film)
+}
+
+fn needed(file: impl AsRef<Path>, part: &str) -> bool {
+    let (file, there) = (file.as_ref(), file.as_ref().exists());
+    if !there {
+        assert!(std::env::var_os("CI").is_none(), "{} is missing; CI must have it", file.display());
+        eprintln!("SKIPPED: {} is missing: run `bash deploy/setup.sh {part}`", file.display());
+    }
+    there
+}
+
+/// Frames of [`clip`].
+pub const CLIP_FRAMES: usize = 120;
+
+/// The first twelve seconds of the demo film, 768x576 at 10 frames/s, as H.264: what a camera can
+/// send as it is. Made once a process.
+pub fn clip() -> Option<PathBuf> {
+    static CLIP: OnceLock<PathBuf> = OnceLock::new();
+    let film = film()?;
+    Some(CLIP.get_or_init(|| cut(&film, "people.mp4", CLIP_FRAMES)).clone())
+}
+
+fn cut(film: &Path, name: &str, frames: usize) -> PathBuf {
+    let made = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("{}-{name}", std::process::id()));
+    let mut spec = SourceSpec::parse(film.to_str().unwrap()).unwrap();
+    spec.pacing = Pacing::AsFastAsPossible;
+    let (done, wait) = mpsc::sync_channel(1);
+    let (mut writer, mut left, path) = (None::<VideoWriter>, frames, made.clone());
+    let source = gakp::ingest::start(&CameraId::new("film").unwrap(), spec, move |event| {
+        let SourceEvent::Frame(frame) = event else { return ControlFlow::Continue(()) };
+        let image = frame.image;
+        let made = writer.get_or_insert_with(|| {
+            let pixels = Pixels::I420(image.range, image.matrix);
+            VideoWriter::create(&path, (image.width, image.height), 10.0, pixels).unwrap()
+        });
+        made.write(&image, frame.time).unwrap();
+        left -= 1;
+        if left > 0 {
+            return ControlFlow::Continue(());
+        }
+        done.send(writer.take()).unwrap();
+        ControlFlow::Break(())
+    });
+    wait.recv_timeout(PATIENCE).expect("the clip").unwrap().finish().unwrap();
+    source.unwrap().stop();
+    made
+}
+
+/// Waits until `so` gives something.
+#[track_caller]
+pub fn eventually<T>(what: &str, mut so: impl FnMut() -> Option<T>) -> T {
+    let since = Instant::now();
+    loop {
+        if let Some(found) = so() {
+            return found;
+        }
+        assert!(since.elapsed() < PATIENCE, "waited in vain: {what}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// Runs `gakp`, which must end by itself in time.
+pub fn run_to_end(args: &[&str], env: &[(&str, &str)]) -> Output {
+    // Files take any amount of output without anyone reading.
+    let [stdout, stderr] = [(); 2].map(|()| tempfile::NamedTempFile::new().unwrap());
+    let mut child = Command::new(GAKP)
+        .args(args)
+        .env_remove("GAKP_LOG")
+        .env_remove("GAKP_MODELS")
+        .envs(env.iter().copied())
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .stdin(Stdio::null())
+        .stdout(stdout.reopen().unwrap())
+        .stderr(stderr.reopen().unwrap())
+        .spawn()
+        .expect("gakp starts");
+    let status = eventually_or(|| child.try_wait().unwrap());
+    if status.is_none() {
+        child.kill().unwrap();
+    }
+    let [stdout, stderr] = [stdout, stderr].map(|file| std::fs::read(file.path()).unwrap());
+    let log = String::from_utf8_lossy(&stderr);
+    let status = status.unwrap_or_else(|| panic!("{args:?} does not end: {log}"));
+    Output { status, stdout, stderr }
+}
+
+/// A child process that is killed when dropped, and what it writes.
+pub struct Process {
+    child: Child,
+    log: Arc<Mutex<String>>,
+}
+
+impl Process {
+    /// Starts `gakp`. What it writes to standard error is kept; standard output is the caller's.
+    pub fn start(args: &[&str]) -> Self {
+        let mut child = Command::new(GAKP)
+            .args(args)
+            .current_dir(env!("CARGO_MANIFEST_DIR"))
+            .env_remove("GAKP_LOG")
+            .env_remove("GAKP_MODELS")
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .expect("gakp starts");
+        let log = Arc::new(Mutex::new(String::new()));
+        let (errors, kept) = (child.stderr.take().unwrap(), log.clone());
+        std::thread::spawn(move || {
+            for line in BufReader::new(errors).lines().map_while(Result::ok) {
+                let mut kept = kept.lock().unwrap();
+                kept.push_str(&line);
+                kept.push('\n');
+            }
+        });
+        Self { child, log }
+    }
+
+    pub fn log(&self) -> String {
+        self.log.lock().unwrap().clone()
+    }
+
+    /// Sends a signal by its name: `TERM`, `STOP`, `CONT`, `KILL`.
+    pub fn signal(&self, name: &str) {
+        let kill = format!("kill -{name} {}", self.child.id());
+        assert!(Command::new("sh").args(["-c", &kill]).status().unwrap().success(), "{kill}");
+    }
+
+    /// Waits for its end, which must come.
+    #[track_caller]
+    pub fn wait(&mut self) -> ExitStatus {
+        let log = self.log.clone();
+        let child = &mut self.child;
+        eventually("the process to end", || {
+            child.try_wait().unwrap().or_else(|| {
+                assert!(!log.lock().unwrap().contains("panicked"), "{}", log.lock().unwrap());
+                None
+            })
+        })
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        // Gone already, perhaps.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        if std::thread::panicking() {
+            eprintln!("--- process {} wrote:\n{}---", self.child.id(), self.log());
+        }
+    }
+}
+
+/// `gakp camera`, a process of its own.
+pub struct CameraProcess {
+    pub process: Process,
+    pub url: String,
+    file: PathBuf,
+    options: Vec<String>,
+}
+
+impl CameraProcess {
+    /// Serves `file` on a free port.
+    pub fn start(file: &Path, options: &[&str]) -> Self {
+        let options = options.iter().map(|o| (*o).to_owned()).collect();
+        Self::start_on("127.0.0.1:0", file.to_owned(), options)
+    }
+
+    fn start_on(listen: &str, file: PathBuf, options: Vec<String>) -> Self {
+        let mut args = vec!["camera", file.to_str().unwrap(), "--listen", listen];
+        args.extend(options.iter().map(String::as_str));
+        let mut process = Process::start(&args);
+        let mut url = String::new();
+        let said = process.child.stdout.take().unwrap();
+        BufReader::new(said).read_line(&mut url).unwrap();
+        assert!(url.starts_with("rtsp://"), "the camera said {url:?} and {}", process.log());
+        Self { process, url: url.trim().to_owned(), file, options }
+    }
+
+    /// Pulls the plug: every connection is gone and nothing listens any more.
+    pub fn kill(&mut self) {
+        self.process.signal("KILL");
+        self.process.wait();
+    }
+
+    /// Plugs it in again, at the same address.
+    pub fn restart(&mut self) {
+        let address = self.url["rtsp://".len()..].split('/').next().unwrap().to_owned();
+        *self = Self::start_on(&address, self.file.clone(), self.options.clone());
+    }
+}
+
+/// `gakp serve` on a free port.
+pub struct Service {
+    pub process: Process,
+    pub address: SocketAddr,
+}
+
+impl Service {
+    /// Starts it and waits until it is ready.
+    pub fn start(state: &Path, args: &[&str]) -> Self {
+        let mut all = vec!["serve", "--listen", "127.0.0.1:0", "--provider", "cpu", "--state-dir"];
+        all.push(state.to_str().unwrap());
+        all.extend(args);
+        let mut process = Process::start(&all);
+        let address = eventually("the page's address in the log", || {
+            let log = process.log();
+            let ended = process.child.try_wait().unwrap();
+            assert!(ended.is_none(), "the service ended: {}", process.log());
+            let (_, rest) = log.split_once("the page is at http://")?;
+            rest.split_once('/')?.0.parse().ok()
+        });
+        let service = Self { process, address };
+        assert_eq!(service.get("/readyz").status, 200);
+        service
+    }
+
+    /// Asks it to end and waits until it has; it must end well.
+    pub fn stop(mut self) -> String {
+        self.process.signal("TERM");
+        let status = self.process.wait();
+        assert_eq!(status.code(), Some(0), "{}", self.process.log());
+        self.process.log()
+    }
+
+    pub fn get(&self, path: &str) -> Response {
+        self.request("GET", path, None)
+    }
+
+    pub fn post(&self, path: &str, body: &Value) -> Response {
+        self.request("POST", path, Some(&body.to_string()))
+    }
+
+    pub fn delete(&self, path: &str) -> Response {
+        self.request("DELETE", path, None)
+    }
+
+    /// HTTP/1.0: the answer ends with the connection and has no chunks.
+    pub fn request(&self, method: &str, path: &str, json: Option<&str>) -> Response {
+        let mut stream = connect(self.address);
+        let mut head = format!("{method} {path} HTTP/1.0\r\nHost: {}\r\n", self.address);
+        if let Some(json) = json {
+            head += &format!("Content-Type: application/json\r\nContent-Length: {}\r\n", json.len());
+        }
+        stream.write_all(format!("{head}\r\n{}", json.unwrap_or("")).as_bytes()).unwrap();
+        let mut bytes = Vec::new();
+        stream.read_to_end(&mut bytes).unwrap();
+        let text = String::from_utf8_lossy(&bytes).into_owned();
+        let (head, body) = text.split_once("\r\n\r\n").expect("a response head");
+        let status = head.split(' ').nth(1).unwrap().parse().unwrap();
+        Response { status, head: head.to_owned(), body: body.to_owned() }
+    }
+
+    /// What the API says of a camera.
+    pub fn camera(&self, name: &str) -> Value {
+        self.get(&format!("/v1/cameras/{name}")).json()
+    }
+
+    /// Waits until the camera is in a state; what the API then says of it.
+    #[track_caller]
+    pub fn wait_for_state(&self, name: &str, state: &str) -> Value {
+        let mut last = Value::Null;
+        let found = eventually_or(|| {
+            last = self.camera(name);
+            (last["state"] == state).then(|| last.clone())
+        });
+        found.unwrap_or_else(|| panic!("camera {name} does not become {state}: {last}"))
+    }
+
+    /// Waits until the camera has tracked at least `more` frames from now on.
+    #[track_caller]
+    pub fn wait_for_frames(&self, name: &str, more: u64) {
+        let tracked = || self.camera(name)["tracked"].as_u64().unwrap();
+        let before = tracked();
+        eventually(&format!("{more} frames of {name}"), || (tracked() >= before + more).then_some(()));
+    }
+
+    pub fn metrics(&self) -> Metrics {
+        let response = self.get("/metrics");
+        assert_eq!(response.status, 200);
+        Metrics::parse(&response.body)
+    }
+
+    pub fn socket(&self, path: &str) -> Socket {
+        Socket::open(connect(self.address), self.address, path, None)
+    }
+
+    pub fn protobuf_socket(&self, path: &str) -> Socket {
+        Socket::open(connect(self.address), self.address, path, Some("gakp.v1.protobuf"))
+    }
+
+    /// A WebSocket that the kernels of both sides buffer little for: few bytes are announced as
+    /// room, and small segments keep the sender's own buffer small.
+    pub fn narrow_socket(&self, path: &str) -> Socket {
+        let socket = RawSocket::new(Domain::IPV4, Type::STREAM, None).unwrap();
+        socket.set_recv_buffer_size(4096).unwrap();
+        socket.set_tcp_mss(536).unwrap();
+        socket.connect(&self.address.into()).unwrap();
+        socket.set_read_timeout(Some(PATIENCE)).unwrap();
+        Socket::open(socket.into(), self.address, path, None)
+    }
+}
+
+fn eventually_or<T>(mut so: impl FnMut() -> Option<T>) -> Option<T> {
+    let since = Instant::now();
+    while since.elapsed() < PATIENCE {
+        if let Some(found) = so() {
+            return Some(found);
+        }
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    None
+}
+
+fn connect(address: SocketAddr) -> TcpStream {
+    let stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream
+}
+
+#[derive(Debug)]
+pub struct Response {
+    pub status: u16,
+    pub head: String,
+    pub body: String,
+}
+
+impl Response {
+    #[track_caller]
+    pub fn json(&self) -> Value {
+        serde_json::from_str(&self.body).unwrap_or_else(|e| panic!("{e}: {self:?}"))
+    }
+}
+
+/// `/metrics`, by the series' full name.
+#[derive(Debug)]
+pub struct Metrics(BTreeMap<String, f64>);
+
+impl Metrics {
+    fn parse(text: &str) -> Self {
+        let lines = text.lines().filter(|line| !line.starts_with('#'));
+        Self(
+            lines.map(|l| l.rsplit_once(' ').unwrap()).map(|(k, v)| (k.into(), v.parse().unwrap())).collect(),
+        )
+    }
+
+    /// The value of a series such as `gakp_camera_up{camera="gate"}`.
+    #[track_caller]
+    pub fn get(&self, series: &str) -> f64 {
+        *self.0.get(series).unwrap_or_else(|| panic!("no series {series} in {:?}", self.0.keys()))
+    }
+
+    pub fn of(&self, name: &str, camera: &str) -> f64 {
+        self.get(&format!("{name}{{camera=\"{camera}\"}}"))
+    }
+
+    pub fn dropped(&self, camera: &str, reason: &str) -> f64 {
+        self.get(&format!("gakp_frames_dropped_total{{camera=\"{camera}\",reason=\"{reason}\"}}"))
+    }
+
+    /// A camera's account: frames in, tracked, dropped for any reason.
+    pub fn account(&self, camera: &str) -> [u64; 3] {
+        let prefix = format!("gakp_frames_dropped_total{{camera=\"{camera}\",");
+        let dropped = self.0.iter().filter(|(series, _)| series.starts_with(&prefix)).map(|(_, v)| v).sum();
+        let counts = [self.of("gakp_frames_in_total", camera), self.of("gakp_frames_tracked_total", camera)];
+        [counts[0], counts[1], dropped].map(|count: f64| count as u64)
+    }
+}
+
+/// A WebSocket client.
+pub struct Socket {
+    socket: WebSocket<TcpStream>,
+}
+
+impl Socket {
+    fn open(stream: TcpStream, address: SocketAddr, path: &str, protocol: Option<&str>) -> Self {
+        let mut request = format!("ws://{address}{path}").into_client_request().unwrap();
+        if let Some(protocol) = protocol {
+            request.headers_mut().insert("sec-websocket-protocol", protocol.parse().unwrap());
+        }
+        let (socket, _) = tungstenite::client(request, stream).expect("the handshake");
+        Self { socket }
+    }
+
+    /// The next message that is no ping; an error when the connection is gone.
+    pub fn message(&mut self) -> tungstenite::Result<Message> {
+        loop {
+            match self.socket.read()? {
+                Message::Ping(_) | Message::Pong(_) => {}
+                message => return Ok(message),
+            }
+        }
+    }
+
+    #[track_caller]
+    pub fn json(&mut self) -> Value {
+        match self.message() {
+            Ok(Message::Text(text)) => serde_json::from_str(&text).unwrap(),
+            other => panic!("not a text message: {other:?}"),
+        }
+    }
+
+    #[track_caller]
+    pub fn binary(&mut self) -> Vec<u8> {
+        match self.message() {
+            Ok(Message::Binary(bytes)) => bytes.into(),
+            other => panic!("not a binary message: {other:?}"),
+        }
+    }
+
+    /// Reads until the server closes; its close code.
+    #[track_caller]
+    pub fn closed(&mut self) -> u16 {
+        loop {
+            match self.message() {
+                Ok(Message::Close(frame)) => return frame.expect("a close code").code.into(),
+                Ok(_) => {}
+                Err(error) => panic!("no goodbye: {error}"),
+            }
+        }
+    }
+}
+
+/// A port that refuses: it was free a moment ago and nothing listens there.
+pub fn refusing_address() -> SocketAddr {
+    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
+}
+
+/// Takes connections and answers whatever comes with `answer`, or never when it is empty.
+pub fn strange_server(answer: &'static [u8]) -> SocketAddr {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap();
+    std::thread::spawn(move || {
+        let mut kept = Vec::new();
+        for stream in listener.incoming() {
+            let Ok(mut stream) = stream else { return };
+            let mut request = [0; 1024];
+            let _ = stream.read(&mut request);
+            let _ = stream.write_all(answer);
+            kept.push(stream);
+        }
+    });
+    address
+}
+
+/// A grey clip of 64x64 pixels at 25 frames/s, which costs next to nothing to send and decode.
+pub fn tiny_clip(folder: &Path) -> PathBuf {
+    use gakp::types::{Image, MediaTime, Plane};
+    let path = folder.join("tiny.mp4");
+    let (range, matrix) = (YuvRange::Limited, YuvMatrix::Bt601);
+    let mut writer = VideoWriter::create(&path, (64, 64), 25.0, Pixels::I420(range, matrix)).unwrap();
+    let planes =
+        [(0, 64), (64 * 64, 32), (64 * 64 * 5 / 4, 32)].map(|(offset, stride)| Plane { offset, stride });
+    let grey = Arc::new(vec![128u8; 64 * 64 * 3 / 2]);
+    for n in 0..100 {
+        let image = Image::i420((64, 64), range, matrix, planes, grey.clone()).unwrap();
+        writer.write(&image, MediaTime::from_secs(f64::from(n) / 25.0)).unwrap();
+    }
+    writer.finish().unwrap();
+    path
+}

@@ -1,0 +1,9 @@
+//! The command line, as the real binary: mistakes, and offline tracking.
+#![cfg(all(feature = "cli", feature = "service", feature = "testcam"))]
+
+#[path = "service/mistakes.rs"]
+mod mistakes;
+#[path = "service/support.rs"]
+mod support;
+#[path = "service/track.rs"]
+mod track;

@@ -1,0 +1,19 @@
+//! `gakp serve` as a real process: real RTSP cameras in, WebSocket, REST, metrics and the page out.
+#![cfg(all(feature = "cli", feature = "service", feature = "testcam"))]
+
+#[path = "service/account.rs"]
+mod account;
+#[path = "browser/cdp.rs"]
+mod cdp;
+#[path = "service/ending.rs"]
+mod ending;
+#[path = "service/failures.rs"]
+mod failures;
+#[path = "service/page.rs"]
+mod page;
+#[path = "service/rest.rs"]
+mod rest;
+#[path = "service/support.rs"]
+mod support;
+#[path = "service/tracks.rs"]
+mod tracks;
