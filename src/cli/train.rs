@@ -9,7 +9,7 @@ use anyhow::{Context, Result, bail, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::{Deserialize, Serialize};
 
-use crate::learn::card::{Card, LICENCE, Unseen};
+use crate::learn::card::{Card, MOTCHALLENGE_LICENCE, Unseen};
 use crate::learn::dataset::{self, LabelledSequence};
 use crate::learn::{Examples, Fit, GruScorer, LinkModel, Recipe, Teacher, fit, logits, metrics, onnx};
 use crate::mot::{Benchmark, Sequence, SequenceInfo, evaluate, first_half_length, parse_truth, replay};
@@ -50,6 +50,9 @@ pub struct Args {
     /// Examples to make.
     #[arg(long, default_value_t = Recipe::default().examples as u64, value_parser = clap::value_parser!(u64).range(1000..=20_000_000))]
     pub examples: u64,
+    /// Licence of the training data, for the card and the file.
+    #[arg(long, value_name = "TEXT", default_value = MOTCHALLENGE_LICENCE, hide_default_value = true)]
+    pub licence: String,
     /// Threads; they do not change the result.
     #[arg(long, value_name = "N")]
     pub threads: Option<usize>,
@@ -182,6 +185,7 @@ fn train(
     let mut card = Card {
         file: name,
         bytes: 0,
+        licence: args.licence.clone(),
         hidden: settings.hidden,
         parameters: model.gru.theta.len(),
         sequences: names(&seen),
@@ -191,7 +195,7 @@ fn train(
         unseen: known.iter().chain(&scores).cloned().collect(),
     };
     let mut metadata: BTreeMap<String, String> = card.settings.iter().cloned().collect();
-    metadata.insert("licence".into(), LICENCE.into());
+    metadata.insert("licence".into(), args.licence.clone());
     metadata.insert("sequences".into(), card.sequences.join(" "));
     metadata.insert("excluded".into(), card.excluded.join(" "));
     let bytes = onnx::write(&model, "Probability that a detection continues a track", &metadata);

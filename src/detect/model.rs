@@ -270,6 +270,7 @@ mod tests {
                 score_threshold: Some(0.3),
                 nms_iou: Some(0.6),
                 width: None,
+                tracking: crate::infer::Calibration::default(),
             }),
         }
     }

@@ -1,5 +1,6 @@
 //! How fast the models are alone: no queue, no decoding of video, no pre-processing of frames.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Barrier};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -72,19 +73,17 @@ pub fn models_alone(
     let Arrangement { workers: threads, max_batch: batch, .. } = arrangement;
     let spec = Arc::new(DetectSpec::new(&plan.detector.entry, &settings.detection)?);
     let barrier = Barrier::new(threads + 1);
-    let shares: Vec<usize> =
-        (0..threads).map(|t| frames / threads + usize::from(t < frames % threads)).collect();
+    // Whoever is free takes the next frames: a thread that the machine holds up does not stand for all.
+    let next = AtomicUsize::new(0);
     thread::scope(|scope| {
-        let runs: Vec<_> = shares
-            .iter()
-            .enumerate()
-            .map(|(index, &share)| {
-                let (plan, spec, barrier) = (&plan, &spec, &barrier);
+        let runs: Vec<_> = (0..threads)
+            .map(|index| {
+                let (plan, spec, barrier, next) = (&plan, &spec, &barrier, &next);
                 let run = move || {
                     let instance = Instance::load(plan, spec, settings, arrangement, work);
                     // Everybody arrives, or nobody would ever start.
                     barrier.wait();
-                    instance?.run(work, share, batch)
+                    instance?.run(work, next, frames, batch)
                 };
                 thread::Builder::new()
                     .name(format!("bench-{index}"))
@@ -160,9 +159,15 @@ impl Instance {
         Ok(Self { detector, tensors, reid, link })
     }
 
-    /// Runs a share of the frames. When it began and ended, and the time in the detector, the
+    /// Runs frames until none is left. When it began and ended, and the time in the detector, the
     /// appearance model and the link scorer.
-    fn run(mut self, work: &[FrameWork], share: usize, batch: usize) -> Result<Span, InferError> {
+    fn run(
+        mut self,
+        work: &[FrameWork],
+        next: &AtomicUsize,
+        frames: usize,
+        batch: usize,
+    ) -> Result<Span, InferError> {
         let mut spent = [Duration::ZERO; 3];
         let start = Instant::now();
         let mut clock = start;
@@ -171,27 +176,31 @@ impl Instance {
             *spent += now - clock;
             clock = now;
         };
-        for at in 0..share {
-            if at % batch == 0 {
-                let (shape, tensor) = &self.tensors[at / batch % self.tensors.len()];
-                self.detector.run_tensor(*shape, tensor)?;
+        loop {
+            let first = next.fetch_add(batch, Ordering::Relaxed);
+            if first >= frames {
+                break;
             }
+            let (shape, tensor) = &self.tensors[first / batch % self.tensors.len()];
+            self.detector.run_tensor(*shape, tensor)?;
             lap(&mut spent[0]);
-            let FrameWork { image, boxes, link } = &work[at % work.len()];
-            if let Some(reid) = &mut self.reid
-                && !boxes.is_empty()
-            {
-                let boxes = boxes.iter().filter_map(|bbox| crate::embed::visible(image, bbox)).collect();
-                reid.run(&[EmbedJob { image: image.clone(), boxes }])?;
+            for at in first..frames.min(first + batch) {
+                let FrameWork { image, boxes, link } = &work[at % work.len()];
+                if let Some(reid) = &mut self.reid
+                    && !boxes.is_empty()
+                {
+                    let boxes = boxes.iter().filter_map(|bbox| crate::embed::visible(image, bbox)).collect();
+                    reid.run(&[EmbedJob { image: image.clone(), boxes }])?;
+                }
+                lap(&mut spent[1]);
+                if let Some(scorer) = &mut self.link
+                    && !link.is_empty()
+                {
+                    super::linker::check(link)?;
+                    scorer.run(std::slice::from_ref(link))?;
+                }
+                lap(&mut spent[2]);
             }
-            lap(&mut spent[1]);
-            if let Some(scorer) = &mut self.link
-                && !link.is_empty()
-            {
-                super::linker::check(link)?;
-                scorer.run(std::slice::from_ref(link))?;
-            }
-            lap(&mut spent[2]);
         }
         Ok((start, clock, spent))
     }

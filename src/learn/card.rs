@@ -7,8 +7,10 @@ use std::fmt::Write as _;
 pub struct Card {
     /// The file's name.
     pub file: String,
-    /// SHA-256 or another mark is the manifest's matter; this is the size in bytes.
+    /// The file's size in bytes.
     pub bytes: usize,
+    /// Licence of the data, and what follows for the weights.
+    pub licence: String,
     /// Width of the hidden state.
     pub hidden: usize,
     /// Number of parameters.
@@ -51,8 +53,8 @@ pub struct Unseen {
     pub id_switches: u64,
 }
 
-/// The licence notice, for the card and for the file's metadata.
-pub const LICENCE: &str = "The weights are trained on annotations and detections of MOTChallenge (MOT15, MOT17), which are \
+/// The licence notice of weights trained on MOTChallenge.
+pub const MOTCHALLENGE_LICENCE: &str = "The weights are trained on annotations and detections of MOTChallenge (MOT15, MOT17), which are \
 licensed CC BY-NC-SA 3.0: attribution, non-commercial, share alike. Treat the weights as bound by it \
 unless you know better; train your own on data of your own for other uses. The program's code is not \
 affected.";
@@ -68,7 +70,7 @@ impl Card {
              track and the detection. A GRU of {} units, the reset gate before the matrix product, {} \
              parameters, {} bytes of ONNX. Boxes only: it sees neither pixels nor the place in the picture. \
              Written by `gakp train`.\n\n\
-             ## Licence of the data\n{LICENCE}\n\n\
+             ## Licence of the data\n{}\n\n\
              ## Input and output\n\
              | | name | type |\n| --- | --- | --- |\n\
              | in | `histories` | f32 `[T, 6, 14]`, observations packed from index 0, oldest first |\n\
@@ -78,7 +80,7 @@ impl Card {
              | out | `probability` | f32 `[P]` |\n\n\
              The features are those of `src/track/features.rs`, raw: normalisation is in the graph. T and P \
              must be at least 1.\n\n",
-            self.file, self.hidden, self.parameters, self.bytes
+            self.file, self.hidden, self.parameters, self.bytes, self.licence
         );
         let _ =
             writeln!(out, "## Data\nSequences ({}): {}.", self.sequences.len(), self.sequences.join(", "));
@@ -139,6 +141,7 @@ mod tests {
     fn names_the_licence_and_what_was_held_out() {
         let card = Card {
             file: "x.onnx".into(),
+            licence: MOTCHALLENGE_LICENCE.into(),
             excluded: vec!["MOT17-02-SDP".into()],
             unseen: vec![Unseen { sequence: "MOT17-02-SDP".into(), auc: 0.98765, ..Unseen::default() }],
             ..Card::default()

@@ -270,7 +270,7 @@ mod tests {
     fn each_person_owns_one_detection() {
         let person = |x: f64| BBox::new(x, 0.0, 40.0, 100.0);
         let people = [(7, person(0.0)), (9, person(200.0))];
-        let detections = [4.0, 2.0, 222.0, 500.0].map(|x| Detection::person(person(x), 0.9));
+        let detections = [4.0, 2.0, 220.0, 500.0].map(|x| Detection::person(person(x), 0.9));
         let expected = [Owner::Near(7), Owner::Of(7), Owner::Near(9), Owner::Nobody];
         assert_eq!(owners(&detections, &people), expected);
         assert_eq!(owners(&detections, &[]), [Owner::Nobody; 4]);

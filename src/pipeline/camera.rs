@@ -185,7 +185,10 @@ impl Camera {
         let capacity = if policy == Policy::Wait { 2 } else { 1 };
         let mailbox = Arc::new(Mailbox::new(capacity, policy, lanes.metrics.queue("frames")));
         let (to_embed, detected) = mpsc::channel(DETECTED);
-        let in_flight = lanes.models.detector.arrangement().workers;
+        // Live, a frame more than the workers take would only grow old. Offline, one waits for each
+        // worker, so that none is idle between two frames.
+        let workers = lanes.models.detector.arrangement().workers;
+        let in_flight = if policy == Policy::Wait { 2 * workers } else { workers };
         let embed = embed::run(
             detected,
             lanes.models.embedder.clone(),

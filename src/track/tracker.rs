@@ -9,6 +9,9 @@ use super::shift::global_shift;
 use super::tracklet::Tracklet;
 use crate::types::{BBox, Detection, Embedding, MediaTime, TrackId, TrackReport};
 
+/// Boxes beyond this many pixels are garbage; squares of such numbers would overflow the filter.
+const MAX_COORDINATE: f64 = 1e6;
+
 /// One frame as the tracker sees it.
 #[derive(Clone, Copy, Debug)]
 pub struct FrameInput<'a> {
@@ -18,7 +21,8 @@ pub struct FrameInput<'a> {
     pub width: f64,
     /// Height of the picture, pixels.
     pub height: f64,
-    /// What was detected, in any order. Boxes that are not finite or have no area are ignored.
+    /// What was detected, in any order. Boxes that are not finite, have no area or lie beyond 1e6 pixels
+    /// are ignored.
     pub detections: &'a [Detection],
     /// The detections' embeddings: empty, or one entry a detection.
     pub embeddings: &'a [Option<Embedding>],
@@ -213,7 +217,11 @@ impl Tracker {
 
     fn take_detections(&mut self, frame: &FrameInput<'_>) {
         let usable = |d: &Detection| {
-            d.bbox.is_valid() && d.score.is_finite() && d.score >= self.config.association.low_score
+            let BBox { x, y, w, h } = d.bbox;
+            d.bbox.is_valid()
+                && [x, y, w, h].iter().all(|v| v.abs() <= MAX_COORDINATE)
+                && d.score.is_finite()
+                && d.score >= self.config.association.low_score
         };
         let mut order: Vec<usize> =
             (0..frame.detections.len()).filter(|&i| usable(&frame.detections[i])).collect();

@@ -1,0 +1,130 @@
+//! `gakp train` from folders to file, card and report; the shipped network.
+#![cfg(all(feature = "learn", feature = "cli"))]
+
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use clap::Parser;
+use gakp::cli::train;
+use gakp::learn::onnx;
+
+#[derive(Parser)]
+struct Command {
+    #[command(flatten)]
+    train: train::Args,
+}
+
+fn args(text: &str) -> train::Args {
+    Command::try_parse_from(std::iter::once("train").chain(text.split(' '))).expect("arguments").train
+}
+
+/// People who walk to and fro past each other; every ninth detection is missing.
+fn write_sequence(root: &Path, name: &str, pace: f64) {
+    let folder = root.join(name);
+    let (mut truth, mut detections) = (String::new(), String::new());
+    for frame in 1..=60u32 {
+        for person in 0..6u32 {
+            let phase = f64::from(frame) * pace + f64::from(person) * 1.7;
+            let (x, y) = (300.0 + 250.0 * phase.sin(), 100.0 + 12.0 * f64::from(person));
+            writeln!(truth, "{frame},{person},{x:.2},{y:.2},40,100,1,1,1").expect("written");
+            if (frame + 4 * person) % 9 != 0 {
+                let noise = f64::from((frame * 7 + person * 3) % 5) - 2.0;
+                writeln!(detections, "{frame},-1,{:.2},{y:.2},40,100,0.9", x + noise).expect("written");
+            }
+        }
+    }
+    for (file, text) in [("gt/gt.txt", &truth), ("det/det.txt", &detections)] {
+        let path = folder.join(file);
+        fs::create_dir_all(path.parent().expect("a folder")).expect("created");
+        fs::write(path, text).expect("written");
+    }
+    let ini = format!("[Sequence]\nname={name}\nframeRate=25\nseqLength=60\nimWidth=640\nimHeight=480\n");
+    fs::write(folder.join("seqinfo.ini"), ini).expect("written");
+}
+
+fn world() -> tempfile::TempDir {
+    let root = tempfile::tempdir().expect("a folder");
+    for (name, pace) in [("MOT17-01-A", 0.05), ("MOT17-01-B", 0.05), ("MOT17-02-A", 0.07), ("walk", 0.06)] {
+        write_sequence(root.path(), name, pace);
+    }
+    root
+}
+
+#[test]
+fn trains_the_same_file_twice_and_says_what_it_held_out() {
+    let root = world();
+    let at = |name: &str| -> PathBuf { root.path().join(name) };
+    let run = |name: &str| {
+        let (data, out, report) = (root.path().display(), at(name), at("report.json"));
+        let text = format!(
+            "{data} --out {} --exclude 01-B --examples 4000 --epochs 3 --report {}",
+            out.display(),
+            report.display()
+        );
+        train::run(args(&text)).expect("trained");
+        fs::read(out).expect("a file")
+    };
+    let bytes = run("a.onnx");
+    assert_eq!(bytes, run("b.onnx"), "the same input gives the same file");
+    let (model, metadata) = onnx::read(&bytes).expect("a link model");
+    assert_eq!(model.gru.shape.hidden, 32);
+    // The copy by the other detector shows the same people: it is held out as well.
+    assert_eq!(metadata["excluded"], "MOT17-01-A MOT17-01-B");
+    assert_eq!(metadata["sequences"], "MOT17-02-A walk");
+    let card = fs::read_to_string(at("a.md")).expect("a card");
+    assert!(card.contains("CC BY-NC-SA 3.0") && card.contains("Held out: MOT17-01-A, MOT17-01-B."), "{card}");
+    let report: train::Report =
+        serde_json::from_str(&fs::read_to_string(at("report.json")).expect("a report")).expect("a report");
+    assert_eq!(report.unseen.len(), 2);
+    for found in &report.unseen {
+        assert!(found.pairs > 100 && found.auc > 0.9 && found.idf1 > 50.0, "{found:?}");
+    }
+}
+
+#[test]
+fn leaves_each_footage_out_once() {
+    let root = world();
+    let out = root.path().join("folds");
+    let text = format!(
+        "{} --out {} --loso MOT17 --examples 2000 --epochs 1 --second-half A",
+        root.path().display(),
+        out.display()
+    );
+    train::run(args(&text)).expect("trained");
+    for (fold, seen) in [("MOT17-01", "MOT17-02-A walk"), ("MOT17-02", "MOT17-01-A MOT17-01-B walk")] {
+        let bytes = fs::read(out.join(format!("{fold}.onnx"))).expect("a file");
+        assert_eq!(onnx::read(&bytes).expect("a link model").1["sequences"], seen);
+    }
+    assert!(!out.join("walk.onnx").exists());
+}
+
+#[test]
+fn refuses_what_it_cannot_use() {
+    let root = world();
+    let data = root.path().display().to_string();
+    let refused = |text: &str| format!("{:#}", train::run(args(text)).expect_err("refused"));
+    let out = format!("--out {data}/x.onnx");
+    for (text, expected) in [
+        (format!("{data}/nowhere {out}"), "nowhere"),
+        (format!("{data}/walk/gt {out}"), "expected folders SEQ/"),
+        (format!("{data} {out} --exclude MOT99"), "no sequence has that in its name"),
+        (format!("{data} {data}/walk {out}"), "walk is given twice"),
+        (format!("{data} --out {data}/no/folder/x.onnx --examples 1000 --epochs 1"), "cannot write"),
+    ] {
+        let message = refused(&text);
+        assert!(message.contains(expected), "{message:?} lacks {expected:?}");
+    }
+    fs::write(root.path().join("walk/det/det.txt"), "1,-1,a,2,3,4,1\n").expect("written");
+    let message = refused(&format!("{data} {out}"));
+    assert!(message.contains("det.txt: line 1"), "{message}");
+}
+
+#[test]
+fn the_shipped_network_is_a_link_model_that_names_its_licence() {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/gakp-gru.onnx");
+    let (model, metadata) = onnx::read(&fs::read(&file).expect("a file")).expect("a link model");
+    assert!(model.gru.theta.iter().all(|v| v.is_finite()));
+    assert!(metadata["licence"].contains("CC BY-NC-SA 3.0"));
+    assert!(!metadata["sequences"].contains("TUD-"), "the demo footage is for testing");
+}
