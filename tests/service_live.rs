@@ -13,6 +13,8 @@ mod failures;
 mod page;
 #[path = "service/rest.rs"]
 mod rest;
+#[path = "service/scores.rs"]
+mod scores;
 #[path = "service/support.rs"]
 mod support;
 #[path = "service/tracks.rs"]
