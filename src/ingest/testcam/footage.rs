@@ -103,8 +103,11 @@ pub(super) fn load(path: &Path, codec: Option<Codec>, fps: Option<f64>) -> Resul
     }
     drop(stopped);
     let caps = caps.ok_or_else(|| failed("there is no video in it".into()))?;
-    let is_h265 = caps.structure(0).is_some_and(|s| s.name() == "video/x-h265");
-    let codec = if is_h265 { Codec::H265 } else { Codec::H264 };
+    let codec = match caps.structure(0).map(|s| s.name().as_str()) {
+        Some("video/x-h265") => Codec::H265,
+        Some("video/mpeg") => Codec::Mpeg4,
+        _ => Codec::H264,
+    };
     // Nobody can decode what comes before the first key frame.
     let first = raw.iter().position(|unit| unit.key).ok_or_else(|| failed("it has no key frame".into()))?;
     raw.drain(..first);
@@ -178,6 +181,9 @@ fn plug(
     let native = match name.as_str() {
         "video/x-h264" => Some(Codec::H264),
         "video/x-h265" => Some(Codec::H265),
+        "video/mpeg" if caps.structure(0).and_then(|s| s.get::<i32>("mpegversion").ok()) == Some(4) => {
+            Some(Codec::Mpeg4)
+        }
         _ => None,
     };
     let codec = wanted.or(native).unwrap_or(Codec::H264);
@@ -193,15 +199,17 @@ fn plug(
     let parser = make(match codec {
         Codec::H264 => "h264parse",
         Codec::H265 => "h265parse",
+        Codec::Mpeg4 => "mpeg4videoparse",
     })?;
     // Parameter sets before every key frame: a client may come at any time.
     parser.set_property("config-interval", -1i32);
     let filter = make("capsfilter")?;
-    let filtered = gst::Caps::builder(codec.media_type())
-        .field("stream-format", "byte-stream")
-        .field("alignment", "au")
-        .build();
-    filter.set_property("caps", filtered);
+    let whole = gst::Caps::builder(codec.media_type());
+    let filtered = match codec {
+        Codec::H264 | Codec::H265 => whole.field("stream-format", "byte-stream").field("alignment", "au"),
+        Codec::Mpeg4 => whole.field("mpegversion", 4i32).field("parsed", true),
+    };
+    filter.set_property("caps", filtered.build());
     chain.extend([parser, filter]);
 
     let broken = |e: gst::glib::BoolError| TestCameraError::Missing(format!("GStreamer graph: {e}"));
@@ -228,6 +236,7 @@ fn encoder(codec: Codec) -> Result<gst::Element, TestCameraError> {
             encoder.set_property("key-int-max", 50u32);
             Ok(encoder)
         }
+        Codec::Mpeg4 => Err(TestCameraError::Missing("MPEG-4 part 2 is passed on, not encoded".into())),
         Codec::H265 => {
             let encoder = make("x265enc")?;
             encoder.set_property_from_str("speed-preset", "veryfast");

@@ -30,6 +30,8 @@ pub enum Codec {
     H264,
     /// H.265 / HEVC.
     H265,
+    /// MPEG-4 part 2, as older cameras send it; only ever passed on, never encoded here.
+    Mpeg4,
 }
 
 impl Codec {
@@ -37,6 +39,7 @@ impl Codec {
         match self {
             Codec::H264 => "video/x-h264",
             Codec::H265 => "video/x-h265",
+            Codec::Mpeg4 => "video/mpeg",
         }
     }
 }
@@ -288,6 +291,7 @@ fn factory(footage: Arc<Footage>, looped: bool, feeds: Arc<Feeds>) -> rtsp::RTSP
     let payloader = match footage.codec {
         Codec::H264 => "rtph264pay aggregate-mode=zero-latency",
         Codec::H265 => "rtph265pay aggregate-mode=zero-latency",
+        Codec::Mpeg4 => "rtpmp4vpay",
     };
     factory.set_launch(&format!("( appsrc name=feed ! {payloader} name=pay0 pt=96 config-interval=-1 )"));
     factory.set_shared(false);
