@@ -22,6 +22,10 @@ const MAX_CONNECTIONS: usize = 512;
 const HEADER_TIMEOUT: Duration = Duration::from_secs(15);
 /// How long sent bytes may stay unacknowledged before the peer counts as dead.
 const PEER_TIMEOUT: Duration = Duration::from_secs(20);
+/// Bytes that may wait in the kernel beyond what the network has under way. More would be handed to
+/// a slow client long after it was news, and the hub, which keeps the newest, would not notice.
+#[cfg(target_os = "linux")]
+const UNSENT: u32 = 16 * 1024;
 /// How long connections have to end once the service stops.
 const DRAIN: Duration = Duration::from_millis(1500);
 
@@ -104,7 +108,11 @@ async fn connection(stream: TcpStream, router: Router, mut stop: Stop) {
     // by its bytes that nobody acknowledges.
     let _ = stream.set_nodelay(true);
     #[cfg(target_os = "linux")]
-    let _ = SockRef::from(&stream).set_tcp_user_timeout(Some(PEER_TIMEOUT));
+    {
+        let socket = SockRef::from(&stream);
+        let _ = socket.set_tcp_user_timeout(Some(PEER_TIMEOUT));
+        let _ = socket.set_tcp_notsent_lowat(UNSENT);
+    }
     let service = TowerToHyperService::new(router);
     let mut builder = http1::Builder::new();
     builder.timer(TokioTimer::new()).header_read_timeout(HEADER_TIMEOUT);
