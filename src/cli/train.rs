@@ -8,6 +8,7 @@ use std::{fs, thread};
 use anyhow::{Context, Result, bail, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 
 use crate::learn::card::{Card, MOTCHALLENGE_LICENCE, Unseen};
 use crate::learn::dataset::{self, LabelledSequence};
@@ -18,7 +19,7 @@ use crate::track::TrackerConfig;
 /// Trains the network that says how probable it is that a detection continues a track.
 ///
 /// ROOTs are MOTChallenge sequences (gt/gt.txt, det/det.txt, seqinfo.ini) or folders of them. Writes an
-/// ONNX file and, beside it, a model card. The same input and settings give the same file.
+/// ONNX file and, beside it, a model card and a manifest. The same input and settings give the same file.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Args {
     /// Sequences, or folders of sequences.
@@ -202,8 +203,33 @@ fn train(
     card.bytes = bytes.len();
     write(out, &bytes)?;
     write(&out.with_extension("md"), card.markdown().as_bytes())?;
+    write(&out.with_extension("toml"), manifest(out, &bytes, &args.licence)?.as_bytes())?;
     println!("wrote {} ({} examples)", out.display(), examples.len());
     Ok(scores)
+}
+
+/// A manifest of this one network, so that `--link OUT.onnx` takes it.
+fn manifest(out: &Path, bytes: &[u8], licence: &str) -> Result<String> {
+    #[derive(Serialize)]
+    struct Entry<'a> {
+        name: &'a str,
+        task: &'a str,
+        family: &'a str,
+        file: &'a str,
+        sha256: String,
+        license: &'a str,
+        source: &'a str,
+    }
+    let entry = Entry {
+        name: out.file_stem().and_then(|n| n.to_str()).unwrap_or("link"),
+        task: "link",
+        family: "gru",
+        file: out.file_name().and_then(|n| n.to_str()).unwrap_or("link.onnx"),
+        sha256: Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect(),
+        license: licence.lines().next().unwrap_or_default(),
+        source: "gakp train",
+    };
+    Ok(toml::to_string(&BTreeMap::from([("model", [entry])]))?)
 }
 
 fn collect(recipe: &Recipe, seen: &[&Source], name: &str) -> Examples {

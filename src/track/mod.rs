@@ -10,7 +10,7 @@
 //! clock, thread, file, random source or model; time is an argument.
 //!
 //! One concept a file, in the order of a frame: [`motion`] and [`kalman`] predict, [`shift`]
-//! follows the camera, [`gate`] picks the pairs, [`features`] describes them, [`association`]
+//! follows the camera, [`gate`] picks the pairs, [`features`] describes them, `association`
 //! and [`assign`] match them, [`tracklet`] lives and dies.
 
 pub mod assign;

@@ -1,6 +1,6 @@
 //! The vocabulary of the flow: boxes, detections, embeddings, identifiers, times, frames, tracks.
 //!
-//! Pure: no I/O, no clock, no serialization. Wire forms live at the edge ([`crate::publish`]).
+//! Pure: no I/O, no clock, no serialization. Wire forms live at the edge (`publish`).
 
 mod bbox;
 mod detection;

@@ -66,7 +66,7 @@ pub fn write(model: &LinkModel, doc: &str, metadata: &BTreeMap<String, String>) 
     .encode_to_vec()
 }
 
-/// The model and the metadata of a file that [`write`] made.
+/// The model and the metadata of a file that [`write()`] made.
 pub fn read(bytes: &[u8]) -> Result<(LinkModel, BTreeMap<String, String>), OnnxError> {
     let file = ModelProto::decode(bytes)?;
     let tensors = file.graph.map(|g| g.initializer).unwrap_or_default();
