@@ -6,7 +6,7 @@
 //!        rows                                                       score
 //! ```
 //!
-//! Pure: text and numbers in, text and numbers out. [`crate::cli`] reads and writes the files.
+//! Pure: text and numbers in, text and numbers out. `cli` reads and writes the files.
 
 mod clear;
 mod hota;
