@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use gakp::ingest::testcam::{TestCamera, TestCameraConfig};
 use jiff::Timestamp;
@@ -50,7 +50,9 @@ impl Ledger {
 
     /// Reads until `enough`, which is asked before every message.
     fn read(mut self, mut socket: Socket, enough: impl Fn(&Self) -> bool) -> (Self, Ended) {
+        let since = Instant::now();
         while !enough(&self) {
+            assert!(since.elapsed() < 4 * PATIENCE, "read on and on: {self:?}");
             match socket.message() {
                 Ok(Message::Close(_)) => return (self, Ended::ByService),
                 Ok(message) => self.take(&message),
