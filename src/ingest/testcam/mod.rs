@@ -150,6 +150,11 @@ impl TestCamera {
         let (frames, codec) = (footage.units.len(), footage.codec);
 
         let server = rtsp::RTSPServer::new();
+        // Clients live in the server's thread: closing one from another thread while its pool thread
+        // reads leaves that thread reading nothing for ever, with a GLib warning each time.
+        let pool = rtsp::RTSPThreadPool::new();
+        pool.set_max_threads(0);
+        server.set_thread_pool(Some(&pool));
         server.set_address(&config.listen.ip().to_string());
         server.set_service(&config.listen.port().to_string());
         let feeds = Arc::new(Feeds::default());
