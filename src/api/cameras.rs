@@ -8,7 +8,8 @@ use jiff::Timestamp;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use tokio::sync::watch;
 
-use crate::types::{CameraId, Frame, FrameTracks};
+use crate::publish::Picture;
+use crate::types::CameraId;
 
 /// The cameras of the service: listing, adding, removing, and their newest tracked pictures.
 pub trait Cameras: Send + Sync + 'static {
@@ -28,15 +29,6 @@ pub trait Cameras: Send + Sync + 'static {
     /// The camera's newest tracked frame with its tracks; `None` inside until the first one. `None`
     /// when there is no such camera. The sender goes when the camera is removed.
     fn video(&self, id: &CameraId) -> Option<watch::Receiver<Option<Arc<Picture>>>>;
-}
-
-/// A frame together with what the tracker said about it.
-#[derive(Clone, Debug)]
-pub struct Picture {
-    /// The frame.
-    pub frame: Arc<Frame>,
-    /// Its tracks.
-    pub tracks: Arc<FrameTracks>,
 }
 
 /// The body of `POST /v1/cameras`. Unknown fields are refused.

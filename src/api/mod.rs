@@ -31,9 +31,7 @@ use axum::extract::DefaultBodyLimit;
 use axum::routing::get;
 use prometheus::Registry;
 
-pub use cameras::{
-    CameraError, CameraState, CameraStatus, Cameras, NewCamera, Picture, TrackCounts, Transport,
-};
+pub use cameras::{CameraError, CameraState, CameraStatus, Cameras, NewCamera, TrackCounts, Transport};
 pub use server::{serve, serve_with};
 pub use socket::KeepAlive;
 

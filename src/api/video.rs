@@ -14,8 +14,8 @@ use axum::body::Bytes;
 use tokio::sync::{Semaphore, watch};
 use tokio::task::spawn_blocking;
 
-use super::{Cameras, Picture};
-use crate::publish::{PictureError, Rgb, RgbConverter, Trails, annotate};
+use super::Cameras;
+use crate::publish::{Picture, PictureError, Rgb, RgbConverter, Trails, annotate};
 use crate::types::{CameraId, FrameTracks};
 
 /// Pictures encoded at a time, over all cameras.

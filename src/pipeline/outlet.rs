@@ -4,8 +4,7 @@ use std::sync::Arc;
 
 use tokio::sync::{mpsc, watch};
 
-use crate::api::Picture;
-use crate::publish::Hub;
+use crate::publish::{Hub, Picture};
 
 /// Takes tracked frames, on the tracker's thread.
 pub trait Outlet: Send {

@@ -13,9 +13,9 @@ use super::camera::{Camera, CameraPlan, CameraState, CameraView, Lanes, MAX_CAME
 use super::mailbox::Policy;
 use super::outlet::LiveOutlet;
 use super::store::{Remembered, Store};
-use crate::api::{self, CameraError, CameraStatus, Cameras, NewCamera, Picture, TrackCounts};
+use crate::api::{self, CameraError, CameraStatus, Cameras, NewCamera, TrackCounts};
 use crate::ingest::{Pacing, SourceError, SourceSpec, Transport};
-use crate::publish::Hub;
+use crate::publish::{Hub, Picture};
 use crate::telemetry::{DropReason, Metrics};
 use crate::track::TrackerConfig;
 use crate::types::{CameraId, Epoch};

@@ -14,6 +14,6 @@ mod report;
 
 pub use draw::{Trails, annotate, colour};
 pub use hub::{Event, Gap, Hub, HubConfig, HubMetrics, Only, Subscription};
-pub use picture::{PictureError, Rgb, RgbConverter};
+pub use picture::{Picture, PictureError, Rgb, RgbConverter};
 pub use protobuf::wire;
 pub use report::{Report, encode_gap_json, encode_gap_protobuf, encode_json, encode_protobuf};

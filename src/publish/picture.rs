@@ -1,13 +1,23 @@
 //! Pictures for people: I420 to RGB, smaller, JPEG.
 
 use std::io;
+use std::sync::Arc;
 
 use fast_image_resize::images::{Image as Resized, ImageRef};
 use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
 use jpeg_encoder::{ColorType, Encoder};
 use yuv::{YuvPlanarImage, YuvStandardMatrix};
 
-use crate::types::{Image, YuvMatrix, YuvRange};
+use crate::types::{Frame, FrameTracks, Image, YuvMatrix, YuvRange};
+
+/// A frame together with what the tracker said about it.
+#[derive(Clone, Debug)]
+pub struct Picture {
+    /// The frame.
+    pub frame: Arc<Frame>,
+    /// Its tracks.
+    pub tracks: Arc<FrameTracks>,
+}
 
 /// A picture in packed RGB: 3 bytes a pixel, rows without padding.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]

@@ -10,9 +10,9 @@ use std::time::{Duration, Instant};
 use futures::future::BoxFuture;
 use futures::{FutureExt, StreamExt};
 use gakp::api::{
-    ApiConfig, CameraError, CameraState, CameraStatus, Cameras, KeepAlive, NewCamera, Picture, TrackCounts,
+    ApiConfig, CameraError, CameraState, CameraStatus, Cameras, KeepAlive, NewCamera, TrackCounts,
 };
-use gakp::publish::{Hub, HubConfig};
+use gakp::publish::{Hub, HubConfig, Picture};
 use gakp::types::{
     BBox, CameraId, CaptureTime, ClassId, Clock, Epoch, Frame, FrameTracks, Image, MediaTime, Plane, TrackId,
     TrackReport, TrackState, YuvMatrix, YuvRange,

@@ -8,12 +8,11 @@ use tokio::sync::mpsc;
 
 use super::super::signals::Signals;
 use super::{Job, Output, progress};
-use crate::api::Picture;
 use crate::infer::Models;
 use crate::ingest::{Pacing, Pixels, SourceSpec, VideoWriter};
 use crate::mot::report_rows;
 use crate::pipeline::{Camera, CameraPlan, CameraState, Collector, Lanes, Policy};
-use crate::publish::{Rgb, RgbConverter, Trails, annotate};
+use crate::publish::{Picture, Rgb, RgbConverter, Trails, annotate};
 use crate::telemetry::Metrics;
 use crate::track::TrackerConfig;
 use crate::types::{CameraId, Epoch};
