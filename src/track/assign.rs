@@ -4,8 +4,10 @@
 /// Solves the rectangular assignment problem: picks `min(rows, cols)` entries, one a row and column
 /// at most, with the least total cost. `cost` is row-major `rows x cols` and must be finite.
 ///
-/// Returns for every row its column (`None` where rows outnumber columns). Deterministic; among
-/// equal totals any may be returned. Time `O(rows^2 cols)` for `rows <= cols`.
+/// Returns for every row its column (`None` where rows outnumber columns). Among equal totals it takes
+/// the one that scipy's `linear_sum_assignment` takes: the figures of `mot` depend on that, so the order
+/// of the search and of the floating-point operations is part of the contract. Time `O(rows^2 cols)` for
+/// `rows <= cols`.
 ///
 /// # Panics
 /// When `cost.len() != rows * cols`.
@@ -28,51 +30,45 @@ pub fn assign(cost: &[f64], rows: usize, cols: usize) -> Vec<Option<usize>> {
     let mut col_price = vec![0.0; cols];
     let mut col_of = vec![FREE; rows];
     let mut row_of = vec![FREE; cols];
-    let mut shortest = vec![f64::INFINITY; cols];
+    let mut shortest = vec![0.0; cols];
     let mut from_row = vec![FREE; cols];
-    let mut row_seen = vec![false; rows];
-    let mut col_seen = vec![false; cols];
+    // Columns that the search has not reached, then those that it has, the latest first.
+    let mut columns: Vec<usize> = Vec::with_capacity(cols);
     for start in 0..rows {
         shortest.fill(f64::INFINITY);
-        row_seen.fill(false);
-        col_seen.fill(false);
+        columns.clear();
+        columns.extend((0..cols).rev());
+        let mut open = cols;
         let (mut row, mut length) = (start, 0.0);
         let sink = loop {
-            row_seen[row] = true;
-            let (mut next, mut least) = (FREE, f64::INFINITY);
-            for col in 0..cols {
-                if col_seen[col] {
-                    continue;
-                }
+            let (mut at, mut least) = (0, f64::INFINITY);
+            for (i, &col) in columns[..open].iter().enumerate() {
                 let reduced = length + cost[row * cols + col] - row_price[row] - col_price[col];
                 if reduced < shortest[col] {
                     shortest[col] = reduced;
                     from_row[col] = row;
                 }
-                // Among equals a free column ends the search soonest.
+                // Among equals a free column ends the search, the last one looked at.
                 if shortest[col] < least || (shortest[col] == least && row_of[col] == FREE) {
                     least = shortest[col];
-                    next = col;
+                    at = i;
                 }
             }
-            debug_assert!(next != FREE, "a finite matrix always has a path");
             length = least;
-            col_seen[next] = true;
-            if row_of[next] == FREE {
-                break next;
+            let col = columns[at];
+            open -= 1;
+            columns.swap(at, open);
+            if row_of[col] == FREE {
+                break col;
             }
-            row = row_of[next];
+            row = row_of[col];
         };
         row_price[start] += length;
-        for row in 0..rows {
-            if row_seen[row] && row != start {
-                row_price[row] += length - shortest[col_of[row]];
+        for &col in &columns[open..] {
+            if row_of[col] != FREE {
+                row_price[row_of[col]] += length - shortest[col];
             }
-        }
-        for col in 0..cols {
-            if col_seen[col] {
-                col_price[col] -= length - shortest[col];
-            }
+            col_price[col] -= length - shortest[col];
         }
         let mut col = sink;
         loop {
