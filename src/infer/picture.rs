@@ -4,7 +4,7 @@
 //! are one matrix, applied while the row is in the cache.
 
 use super::manifest::{ColourOrder, InputSpec};
-use super::scale::PlaneScaler;
+use super::scale::{PlaneScaler, isa};
 use crate::types::{BBox, Image, YuvMatrix, YuvRange};
 
 /// Resizes parts of frames; keeps its buffers between calls.
@@ -92,28 +92,45 @@ impl Rasteriser {
         }
         let mut target = Target { tensor, width, area: width * height };
         #[cfg(target_arch = "x86_64")]
-        {
-            #[target_feature(enable = "avx2")]
-            fn convert_avx2(
-                rasteriser: &mut Rasteriser,
-                image: &Image,
-                matrix: &ColourMatrix,
-                place: Placement,
-                target: &mut Target<'_>,
-            ) {
-                rasteriser.convert::<true>(image, matrix, place, target);
+        // SAFETY: the machine has the instructions.
+        unsafe {
+            if std::arch::is_x86_feature_detected!("avx512bw") {
+                return self.convert_avx512(image, &matrix, place, &mut target);
             }
             if std::arch::is_x86_feature_detected!("avx2") {
-                // SAFETY: the machine has AVX2.
-                return unsafe { convert_avx2(self, image, &matrix, place, &mut target) };
+                return self.convert_avx2(image, &matrix, place, &mut target);
             }
         }
-        self.convert::<false>(image, &matrix, place, &mut target);
+        self.convert::<{ isa::PLAIN }>(image, &matrix, place, &mut target);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx512f,avx512bw")]
+    fn convert_avx512(
+        &mut self,
+        image: &Image,
+        matrix: &ColourMatrix,
+        place: Placement,
+        target: &mut Target<'_>,
+    ) {
+        self.convert::<{ isa::AVX512 }>(image, matrix, place, target);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn convert_avx2(
+        &mut self,
+        image: &Image,
+        matrix: &ColourMatrix,
+        place: Placement,
+        target: &mut Target<'_>,
+    ) {
+        self.convert::<{ isa::AVX2 }>(image, matrix, place, target);
     }
 
     /// Scales, converts and normalises row by row, while a row is in the cache.
     #[inline(always)]
-    fn convert<const AVX2: bool>(
+    fn convert<const ISA: u8>(
         &mut self,
         image: &Image,
         matrix: &ColourMatrix,
@@ -123,7 +140,7 @@ impl Rasteriser {
         let Placement { x, y, w, h, .. } = place;
         for row in 0..h {
             for (index, (plane, out)) in self.planes.iter_mut().zip(&mut self.rows).enumerate() {
-                plane.row::<AVX2>(image, index, row, out);
+                plane.row::<ISA>(image, index, row, out);
             }
             let [ys, us, vs] = &self.rows;
             for channel in 0..3 {
@@ -294,6 +311,8 @@ mod tests {
             ((500, 300), Full, Bt601, whole(500, 300), wide, Rgb),
             ((1, 1), Full, Bt601, whole(1, 1), wide, Rgb),
             ((3, 100), Limited, Bt601, whole(3, 100), full, Rgb),
+            // Further apart than a vector reaches.
+            ((30000, 2), Full, Bt601, whole(30000, 2), full, Rgb),
         ] {
             let image = picture(size.0, size.1, range, matrix);
             let normalisation = Normalisation::new(&InputSpec {
@@ -311,12 +330,23 @@ mod tests {
             let mut tensor = vec![f32::NAN; 3 * place.width * place.height];
             rasteriser.write(&image, from, place, &normalisation, &mut tensor);
             // Whatever the machine has, the result is the same.
-            let mut plain = tensor.clone();
             let matrix = ColourMatrix::new(&image, &normalisation);
-            let mut target =
-                Target { tensor: &mut plain, width: place.width, area: place.width * place.height };
-            rasteriser.convert::<false>(&image, &matrix, place, &mut target);
-            assert_eq!(tensor, plain);
+            let mut again =
+                |convert: fn(&mut Rasteriser, &Image, &ColourMatrix, Placement, &mut Target<'_>)| {
+                    let mut other = tensor.clone();
+                    let mut target =
+                        Target { tensor: &mut other, width: place.width, area: place.width * place.height };
+                    convert(&mut rasteriser, &image, &matrix, place, &mut target);
+                    assert_eq!(tensor, other);
+                };
+            again(Rasteriser::convert::<{ isa::PLAIN }>);
+            #[cfg(target_arch = "x86_64")]
+            if std::arch::is_x86_feature_detected!("avx2") {
+                // SAFETY: the machine has the instructions.
+                again(|this, image, matrix, place, target| unsafe {
+                    this.convert_avx2(image, matrix, place, target);
+                });
+            }
             let (mut worst, mut total) = (0f64, 0f64);
             for y in 0..place.height {
                 for x in 0..place.width {

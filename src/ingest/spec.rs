@@ -41,7 +41,8 @@ pub struct SourceSpec {
     pub silence: Duration,
     /// RTSP's jitter buffer: how long to wait for a late packet. 100 ms.
     pub latency: Duration,
-    /// Threads of a software decoder. `None`: 1 for a camera, which adds no delay, 2 for a file.
+    /// Threads of a software decoder. `None`: 1 for a camera, which adds no delay; for a file a quarter of
+    /// the cores, at most 4.
     pub decoder_threads: Option<u32>,
     /// Decode on the CPU even where a hardware decoder exists.
     pub software_decoder: bool,

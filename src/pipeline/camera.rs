@@ -20,6 +20,9 @@ use crate::types::{CameraId, Epoch, Frame};
 /// Cameras that one service takes: the link stage's queue holds one job each.
 pub const MAX_CAMERAS: usize = 1024;
 
+/// Frames of a file that are decoded ahead.
+const AHEAD: usize = 8;
+
 /// Detections of a camera that may wait to be embedded.
 const DETECTED: usize = 2;
 
@@ -182,7 +185,7 @@ impl Camera {
             }),
         });
         let seat = lanes.tracker.attach(id.clone(), epoch, tracker, outlet, metrics).await?;
-        let capacity = if policy == Policy::Wait { 2 } else { 1 };
+        let capacity = if policy == Policy::Wait { AHEAD } else { 1 };
         let mailbox = Arc::new(Mailbox::new(capacity, policy, lanes.metrics.queue("frames")));
         let (to_embed, detected) = mpsc::channel(DETECTED);
         // Live, a frame more than the workers take would only grow old. Offline, one waits for each
