@@ -257,7 +257,7 @@ mod tests {
         let weights = |start: f64, length: f64, out: usize, outs: usize, size: usize| {
             let scale = length / outs as f64;
             let mut block = 1;
-            while (2 * block) as f64 <= scale {
+            while (2 * block) as f64 <= scale && block < 256 {
                 block *= 2;
             }
             let blocks = size / block;
