@@ -70,8 +70,12 @@ pub struct TrackerOptions {
     pub birth_score: Option<f64>,
     /// Hits until a track is confirmed.
     pub confirm_hits: Option<u32>,
-    /// How long a missed track stays confirmed, seconds.
+    /// How long a missed track stays confirmed at most, seconds.
     pub coast_s: Option<f64>,
+    /// Whether the existence head of the link model decides which boxes are output.
+    pub existence: Option<bool>,
+    /// How long a missed track may take a low-scored detection, seconds; 0 never.
+    pub second_stage_s: Option<f64>,
     /// How long a lost track is kept, seconds.
     pub lost_s: Option<f64>,
     /// Whether the camera may move.
@@ -213,6 +217,17 @@ impl TrackerOptions {
                 "tracker.coast_s = {coast}: must be from 0 to lost_s"
             );
             base.life.coast = coast;
+            base.existence.coast = coast;
+        }
+        if self.existence == Some(false) {
+            base.existence.head = None;
+        }
+        if let Some(seconds) = self.second_stage_s {
+            ensure!(
+                seconds.is_finite() && seconds >= 0.0,
+                "tracker.second_stage_s = {seconds}: must not be negative"
+            );
+            base.association.second_stage_within = seconds;
         }
         if let Some(hits) = self.confirm_hits {
             ensure!(hits >= 1, "tracker.confirm_hits = 0: must be at least 1");

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::convert::Infallible;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::{fs, thread};
 
 use anyhow::{Context, Result, bail, ensure};
@@ -12,9 +13,12 @@ use sha2::{Digest, Sha256};
 
 use crate::learn::card::{Card, MOTCHALLENGE_LICENCE, Unseen};
 use crate::learn::dataset::{self, LabelledSequence};
-use crate::learn::{Examples, Fit, GruScorer, LinkModel, Recipe, Teacher, fit, logits, metrics, onnx};
-use crate::mot::{Benchmark, Sequence, SequenceInfo, evaluate, first_half_length, parse_truth, replay};
-use crate::track::TrackerConfig;
+use crate::learn::{
+    Boxes, Examples, Fit, GruScorer, HeadFit, LinkModel, Recipe, Teacher, fit, fit_head, logits, metrics,
+    onnx,
+};
+use crate::mot::{Benchmark, Row, Sequence, SequenceInfo, evaluate, first_half_length, parse_truth, replay};
+use crate::track::{ExistenceHead, TrackerConfig};
 
 /// Trains the network that says how probable it is that a detection continues a track.
 ///
@@ -164,10 +168,14 @@ fn train(
         ..Fit::default()
     };
     let model = run_fit(&settings, &examples, &name);
+    let boxes = boxes(&model, &seen, &args.second_half, &name)?;
+    ensure!(!boxes.is_empty(), "the tracker confirms no track in the training sequences");
+    let head_fit = HeadFit { seed: args.seed, ..HeadFit::default() };
+    let head = Arc::new(fit_head(&boxes, &head_fit));
 
     let mut scores = vec![];
     for source in &held {
-        let found = score(&model, source, &args.second_half)?;
+        let found = score(&model, &head, source, &args.second_half)?;
         println!(
             "{name} {}: {} pairs, AUC {:.4}, cross-entropy {:.4}, calibration error {:.4}; HOTA {:.2} MOTA {:.2} IDF1 {:.2} IDs {}",
             found.sequence,
@@ -192,11 +200,13 @@ fn train(
         sequences: names(&seen),
         excluded: names(&held),
         examples: (examples.len(), examples.positive_share()),
+        boxes: (boxes.len(), boxes.positive_share()),
         settings: describe(&settings, &recipe),
         unseen: known.iter().chain(&scores).cloned().collect(),
     };
     let mut metadata: BTreeMap<String, String> = card.settings.iter().cloned().collect();
     metadata.insert("licence".into(), args.licence.clone());
+    metadata.insert("existence".into(), head.to_string());
     metadata.insert("sequences".into(), card.sequences.join(" "));
     metadata.insert("excluded".into(), card.excluded.join(" "));
     let bytes = onnx::write(&model, "Probability that a detection continues a track", &metadata);
@@ -261,25 +271,62 @@ fn bar(length: u64, form: &str) -> ProgressBar {
     ProgressBar::new(length).with_style(style)
 }
 
-/// Pairs and tracks of a sequence under a network that has not seen it.
-fn score(model: &LinkModel, source: &Source, second_half: &[String]) -> Result<Unseen> {
+/// The frames of a sequence that count, and their truth, both from the first one on.
+fn counted(source: &Source, second_half: &[String]) -> Result<(bool, LabelledSequence, Vec<Row>)> {
     let labelled = &source.labelled;
     let half = second_half.iter().any(|s| labelled.name.strip_suffix(s).is_some_and(|n| n.ends_with('-')));
     let length = labelled.frames.len() as u32;
     let skip = if half { first_half_length(length).min(length) } else { 0 };
-    let mut counted = labelled.clone();
-    counted.frames.drain(..skip as usize);
+    let mut sequence = labelled.clone();
+    sequence.frames.drain(..skip as usize);
+    let file = source.folder.join("gt/gt.txt");
+    let text = fs::read_to_string(&file).with_context(|| format!("cannot read {}", file.display()))?;
+    let mut truth = parse_truth(&text, Some(length)).with_context(|| file.display().to_string())?;
+    if half {
+        truth = crate::mot::second_half(&truth, length);
+    }
+    Ok((half, sequence, truth))
+}
+
+/// What the tracker puts out on the sequences that the network was trained on.
+fn boxes(model: &LinkModel, seen: &[&Source], second_half: &[String], name: &str) -> Result<Boxes> {
+    let bar = bar(seen.len() as u64, "{msg} {wide_bar} {pos}/{len}");
+    bar.set_message(format!("{name}: boxes"));
+    let mut scorer = GruScorer::new(model.clone());
+    let mut boxes = Boxes::default();
+    for source in seen {
+        let (_, sequence, truth) = counted(source, second_half)?;
+        boxes.collect(&sequence, &truth, &TrackerConfig::default(), |request| {
+            let mut links = vec![];
+            scorer.score(request, &mut links);
+            links
+        });
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    Ok(boxes)
+}
+
+/// Pairs and tracks of a sequence under a network and a head that have not seen it.
+fn score(
+    model: &LinkModel,
+    head: &Arc<ExistenceHead>,
+    source: &Source,
+    second_half: &[String],
+) -> Result<Unseen> {
+    let (half, counted, truth) = counted(source, second_half)?;
+    let length = counted.frames.len() as u32;
     let mut pairs = Examples::default();
     Teacher::natural().collect(&counted, &mut fastrand::Rng::with_seed(0), &mut pairs);
     let link = metrics::scores(&logits(model, &pairs), pairs.labels(), pairs.weights());
 
     let sequence = Sequence {
         info: SequenceInfo {
-            name: labelled.name.clone(),
-            frame_rate: labelled.frame_rate,
-            length: length - skip,
-            width: labelled.width as u32,
-            height: labelled.height as u32,
+            name: counted.name.clone(),
+            frame_rate: counted.frame_rate,
+            length,
+            width: counted.width as u32,
+            height: counted.height as u32,
         },
         detections: counted.frames.iter().map(|f| f.detections.clone()).collect(),
     };
@@ -289,17 +336,13 @@ fn score(model: &LinkModel, source: &Source, second_half: &[String]) -> Result<U
         scorer.score(request, &mut links);
         Ok::<_, Infallible>(links)
     };
-    let rows = replay(&sequence, &TrackerConfig::default(), |_| vec![], links)?;
-    let file = source.folder.join("gt/gt.txt");
-    let text = fs::read_to_string(&file).with_context(|| format!("cannot read {}", file.display()))?;
-    let mut truth = parse_truth(&text, Some(length)).with_context(|| file.display().to_string())?;
-    if half {
-        truth = crate::mot::second_half(&truth, length);
-    }
-    let tracks = evaluate(&truth, &rows, length - skip, Benchmark::of(&labelled.name, &truth))
-        .with_context(|| labelled.name.clone())?;
+    let mut config = TrackerConfig::default();
+    config.existence.head = Some(head.clone());
+    let rows = replay(&sequence, &config, |_| vec![], links)?;
+    let tracks = evaluate(&truth, &rows, length, Benchmark::of(&counted.name, &truth))
+        .with_context(|| counted.name.clone())?;
     Ok(Unseen {
-        sequence: labelled.name.clone(),
+        sequence: counted.name.clone(),
         second_half: half,
         pairs: pairs.len(),
         auc: link.auc,

@@ -2,10 +2,13 @@
 //!
 //! The graph takes `histories` f32 `[T, 6, 14]`, `lengths` i32 `[T]`, `candidates` f32 `[P, 20]` and
 //! `pair_track` i64 `[P]` (which history a candidate belongs to) and gives `probability` f32 `[P]`.
+//! The file's metadata may hold an [`ExistenceHead`], trained on what the tracker makes of these very
+//! probabilities, as `existence`.
+//!
 //! Requests of several cameras are joined by concatenation; `pair_track` moves by the tracks before it.
 
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use ort::session::Session;
@@ -15,7 +18,7 @@ use super::graph::check_type;
 use super::manifest::ModelEntry;
 use super::runtime::Runtime;
 use super::{Arrangement, BatchModel, Batcher, InferError, Observer, Task};
-use crate::track::{CANDIDATE_FEATURES, HISTORY, LinkRequest, STEP_FEATURES};
+use crate::track::{CANDIDATE_FEATURES, ExistenceHead, HISTORY, LinkRequest, STEP_FEATURES, TrackerConfig};
 
 const MODEL: &str = Task::Link.as_str();
 const INPUTS: [(&str, TensorElementType); 4] = [
@@ -25,11 +28,14 @@ const INPUTS: [(&str, TensorElementType); 4] = [
     ("pair_track", TensorElementType::Int64),
 ];
 const OUTPUT: &str = "probability";
+/// Metadata that holds the existence head.
+const EXISTENCE: &str = "existence";
 
 /// Scores link requests. Clones share the model.
 #[derive(Clone)]
 pub struct Linker {
     batcher: Arc<Batcher<LinkModel>>,
+    existence: Option<Arc<ExistenceHead>>,
 }
 
 impl Linker {
@@ -42,12 +48,21 @@ impl Linker {
         observer: Arc<dyn Observer>,
     ) -> Result<Self, InferError> {
         let (runtime, name, file) = (runtime.clone(), entry.name.clone(), file.to_path_buf());
+        let existence = Arc::new(OnceLock::new());
+        let found = existence.clone();
         let batcher = Batcher::start(MODEL, arrangement, observer, move |_| {
             let mut model = LinkModel::load(&runtime, &name, &file)?;
+            found.get_or_init(|| model.existence.take());
             model.run(&[warm_up()])?;
             Ok(model)
         })?;
-        Ok(Self { batcher: Arc::new(batcher) })
+        Ok(Self { batcher: Arc::new(batcher), existence: existence.get().cloned().flatten() })
+    }
+
+    /// `tracker` with the existence head that the model's file carries, if it does.
+    pub fn calibrate(&self, mut tracker: TrackerConfig) -> TrackerConfig {
+        tracker.existence.head = self.existence.clone();
+        tracker
     }
 
     /// The probabilities of a request's pairs, in their order, each in `[0, 1]`. An empty request is
@@ -111,6 +126,7 @@ fn warm_up() -> LinkRequest {
 /// One instance of the link scorer.
 pub(super) struct LinkModel {
     session: Session,
+    existence: Option<Arc<ExistenceHead>>,
     /// The joined request of a batch.
     joined: LinkRequest,
     pair_track: Vec<i64>,
@@ -136,7 +152,17 @@ impl LinkModel {
         let outlet = session.outputs().iter().find(|outlet| outlet.name() == OUTPUT);
         let outlet = outlet.ok_or_else(|| wrong(format!("it has no output {OUTPUT:?}")))?;
         check_type("output", outlet, TensorElementType::Float32).map_err(wrong)?;
-        Ok(Self { session, joined: LinkRequest::default(), pair_track: vec![], last: Duration::ZERO })
+        let existence = session.metadata().ok().and_then(|metadata| metadata.custom(EXISTENCE));
+        let existence = existence.map(|text| text.parse()).transpose();
+        let existence =
+            existence.map_err(|e| wrong(format!("its existence head is broken: {e}")))?.map(Arc::new);
+        Ok(Self {
+            session,
+            existence,
+            joined: LinkRequest::default(),
+            pair_track: vec![],
+            last: Duration::ZERO,
+        })
     }
 
     /// Runs the joined request; `None` when ONNX Runtime gives fewer or more probabilities than pairs.

@@ -149,7 +149,10 @@ impl Models {
     /// `tracker` with what is known of the models.
     pub fn calibrate(&self, mut tracker: TrackerConfig) -> TrackerConfig {
         self.calibration.iter().for_each(|calibration| calibration.apply(&mut tracker));
-        tracker
+        match &self.linker {
+            Some(linker) => linker.calibrate(tracker),
+            None => tracker,
+        }
     }
 
     /// Stops all models: takes no more requests, answers those in the queues, joins the workers.

@@ -12,6 +12,7 @@ mod adam;
 pub mod card;
 pub mod dataset;
 mod examples;
+mod existence;
 mod fit;
 mod gemm;
 mod gru;
@@ -25,6 +26,7 @@ mod teacher;
 
 pub use adam::{Adam, Schedule};
 pub use examples::Examples;
+pub use existence::{Boxes, HeadFit, fit_head};
 pub use fit::{Fit, Progress, fit, logits};
 pub use gru::{Batch, Gru, GruShape, Tape};
 pub use model::{LinkModel, Normaliser};

@@ -3,6 +3,10 @@
 //! Lengths marked `h` are in units of the box's height, so that the tracker is invariant to
 //! resolution; times are in seconds, so that it is invariant to frame rate.
 
+use std::sync::Arc;
+
+use super::existence::ExistenceHead;
+
 /// All settings of a [`super::Tracker`].
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TrackerConfig {
@@ -20,6 +24,8 @@ pub struct TrackerConfig {
     pub birth: BirthConfig,
     /// Confirmation, loss and death.
     pub life: LifeConfig,
+    /// Which boxes of confirmed tracks are output.
+    pub existence: ExistenceConfig,
 }
 
 /// Noise of the constant-velocity Kalman filter over `(cx, cy, w, h)`.
@@ -168,7 +174,7 @@ impl Default for AssociationConfig {
             min_link_after: 0.3,
             min_score: 0.15,
             min_score_tentative: 0.1,
-            second_stage_within: 0.5,
+            second_stage_within: 0.0,
             second_stage_iou: 0.5,
         }
     }
@@ -235,7 +241,8 @@ impl Default for BirthConfig {
 pub struct LifeConfig {
     /// A track is confirmed at this many hits; a tentative one dies at its first miss.
     pub confirm_hits: u32,
-    /// A confirmed track that is missed stays `confirmed`, its box predicted, this long, s.
+    /// A confirmed track that is missed stays `confirmed`, its box predicted, this long, s (where no
+    /// existence head decides).
     pub coast: f64,
     /// A track missed longer than this dies, s.
     pub lost: f64,
@@ -248,5 +255,25 @@ pub struct LifeConfig {
 impl Default for LifeConfig {
     fn default() -> Self {
         Self { confirm_hits: 3, coast: 0.15, lost: 2.0, max_tracks: 1000, max_detections: 1000 }
+    }
+}
+
+/// A learned decision on what is output: [`super::ExistenceHead`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct ExistenceConfig {
+    /// The network. Without one, what is matched is output, and what is missed for
+    /// [`LifeConfig::coast`].
+    pub head: Option<Arc<ExistenceHead>>,
+    /// Least log-odds of a matched box that is output: the detection speaks for it, so doubt must be plain.
+    pub matched: f64,
+    /// Least log-odds of a coasted box that is output.
+    pub coasted: f64,
+    /// A track missed longer than this is not output, whatever the network says, s.
+    pub coast: f64,
+}
+
+impl Default for ExistenceConfig {
+    fn default() -> Self {
+        Self { head: None, matched: -1.0, coasted: 0.0, coast: 0.5 }
     }
 }

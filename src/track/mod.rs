@@ -11,11 +11,12 @@
 //!
 //! One concept a file, in the order of a frame: [`motion`] and [`kalman`] predict, [`shift`]
 //! follows the camera, [`gate`] picks the pairs, [`features`] describes them, `association`
-//! and [`assign`] match them, [`tracklet`] lives and dies.
+//! and [`assign`] match them, [`tracklet`] lives and dies, [`existence`] says what is shown.
 
 pub mod assign;
 mod association;
 mod config;
+pub mod existence;
 pub mod features;
 pub mod gate;
 pub mod kalman;
@@ -27,8 +28,9 @@ pub mod tracklet;
 
 pub use association::{Match, match_pairs};
 pub use config::{
-    AppearanceConfig, AssociationConfig, BirthConfig, FilterConfig, GateConfig, LifeConfig, NoiseAdaptation,
-    PairScore, ShiftConfig, TrackerConfig,
+    AppearanceConfig, AssociationConfig, BirthConfig, ExistenceConfig, FilterConfig, GateConfig, LifeConfig,
+    NoiseAdaptation, PairScore, ShiftConfig, TrackerConfig,
 };
+pub use existence::{Dense, EXISTENCE_FEATURES, ExistenceHead, HeadError};
 pub use link::{CANDIDATE_FEATURES, HISTORY, LinkRequest, Pair, STEP_FEATURES};
 pub use tracker::{Decision, FrameInput, GatedPair, TrackError, Tracker, Update};

@@ -1,7 +1,8 @@
 //! The tracker of one camera: predict, then update, once a frame.
 
 use super::association::{Match, match_pairs};
-use super::config::{PairScore, TrackerConfig};
+use super::config::{ExistenceConfig, PairScore, TrackerConfig};
+use super::existence;
 use super::features;
 use super::gate::{PairGeometry, gate};
 use super::link::{LinkRequest, Pair};
@@ -189,6 +190,7 @@ impl Tracker {
             self.learn_appearance(m);
         }
         for track in &mut self.tracks {
+            track.count_frame();
             track.confirmed |= track.hits >= self.config.life.confirm_hits;
         }
         let (width, height) = self.size;
@@ -212,7 +214,28 @@ impl Tracker {
                 self.next_id += 1;
             }
         }
-        Ok(Update { tracks: self.tracks.iter().map(|t| report(t, &self.config)).collect(), ended })
+        let shown = self.shown();
+        Ok(Update {
+            tracks: self.tracks.iter().zip(shown).map(|(t, shown)| report(t, shown)).collect(),
+            ended,
+        })
+    }
+
+    /// Whether each track's box shows its object now, as far as can be told; of confirmed tracks only.
+    fn shown(&self) -> Vec<bool> {
+        let Some(head) = &self.config.existence.head else {
+            let coast = self.config.life.coast;
+            return self.tracks.iter().map(|t| t.matched || t.missed_for() <= coast).collect();
+        };
+        let ExistenceConfig { matched, coasted, coast, .. } = self.config.existence;
+        let (width, height) = self.size;
+        let values = existence::features(&self.tracks, width, height);
+        let shown = |(track, values): (&Tracklet, &_)| {
+            track.confirmed
+                && (track.matched || track.missed_for() <= coast)
+                && f64::from(head.logit(values)) >= if track.matched { matched } else { coasted }
+        };
+        self.tracks.iter().zip(&values).map(shown).collect()
     }
 
     fn take_detections(&mut self, frame: &FrameInput<'_>) {
@@ -426,11 +449,11 @@ impl Tracker {
     }
 }
 
-fn report(track: &Tracklet, config: &TrackerConfig) -> TrackReport {
+fn report(track: &Tracklet, shown: bool) -> TrackReport {
     let [vx, vy, ..] = track.filter.velocity();
     TrackReport {
         id: track.id,
-        state: track.state(&config.life),
+        state: track.state(shown),
         class: track.class,
         bbox: track.bbox(),
         confidence: track.last().score,

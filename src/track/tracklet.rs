@@ -8,6 +8,9 @@ use super::link::HISTORY;
 use super::motion::{measurement_noise, motion, newborn};
 use crate::types::{BBox, ClassId, Detection, Embedding, MediaTime, TrackId, TrackState};
 
+/// Where the running mean of innovations begins, heights.
+const TYPICAL_INNOVATION: f64 = 0.1;
+
 /// One detection that was matched to a track.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Observation {
@@ -45,8 +48,18 @@ pub struct Tracklet {
     pub time: MediaTime,
     /// Up to [`HISTORY`] last observations, the oldest first; never empty.
     pub history: VecDeque<Observation>,
+    /// When it was born.
+    pub born: MediaTime,
+    /// Frames since then, that of its birth included.
+    pub frames: u32,
     /// Matches so far, birth included.
     pub hits: u32,
+    /// Frames since the last match.
+    pub missed_frames: u32,
+    /// Since when it has been matched in every frame; of old if it is missed now.
+    pub matched_since: MediaTime,
+    /// Running mean of the length of its innovations `(dx/h, dy/h)`.
+    pub mean_innovation: f64,
     /// Whether it was believed once; never taken back.
     pub confirmed: bool,
     /// Whether a detection of the current frame was matched.
@@ -75,7 +88,12 @@ impl Tracklet {
             filter: newborn(config, [bbox.cx(), bbox.cy(), bbox.w, bbox.h]),
             time,
             history,
+            born: time,
+            frames: 1,
             hits: 1,
+            missed_frames: 0,
+            matched_since: time,
+            mean_innovation: TYPICAL_INNOVATION,
             confirmed: false,
             matched: true,
             link: 1.0,
@@ -107,21 +125,30 @@ impl Tracklet {
     /// Takes a detection of `link` probability (Eq. mean_update, covariance_update with R*).
     pub fn observe(&mut self, detection: &Detection, link: f64, time: MediaTime, config: &FilterConfig) {
         let (predicted, seen) = (self.bbox(), detection.bbox);
+        let innovation = innovation(&predicted, &seen);
         if self.history.len() == HISTORY {
             self.history.pop_front();
         }
-        self.history.push_back(Observation {
-            bbox: seen,
-            time,
-            score: detection.score,
-            innovation: innovation(&predicted, &seen),
-        });
+        self.history.push_back(Observation { bbox: seen, time, score: detection.score, innovation });
+        self.mean_innovation += 0.2 * (innovation[0].hypot(innovation[1]) - self.mean_innovation);
+        if self.missed_frames > 0 {
+            self.matched_since = time;
+        }
+        self.missed_frames = 0;
         let r = measurement_noise(config, predicted.h, config.adaptation.measurement_factor(link));
         self.filter.update([seen.cx(), seen.cy(), seen.w, seen.h], r);
         self.hits = self.hits.saturating_add(1);
         self.matched = true;
         self.link = link;
         self.class = detection.class;
+    }
+
+    /// Counts a frame whose matches have been applied.
+    pub fn count_frame(&mut self) {
+        self.frames = self.frames.saturating_add(1);
+        if !self.matched {
+            self.missed_frames = self.missed_frames.saturating_add(1);
+        }
     }
 
     /// Moves everything that it knows by the camera's shift; velocities stay.
@@ -143,12 +170,13 @@ impl Tracklet {
         self.time.since(self.last().time)
     }
 
-    /// Stage of life.
-    pub fn state(&self, config: &LifeConfig) -> TrackState {
-        match (self.confirmed, self.matched || self.missed_for() <= config.coast) {
-            (false, _) => TrackState::Tentative,
-            (true, true) => TrackState::Confirmed,
-            (true, false) => TrackState::Lost,
+    /// Stage of life of a track whose object is shown by its box now (`shown`) or not.
+    pub fn state(&self, shown: bool) -> TrackState {
+        match (self.confirmed && shown, self.matched) {
+            (true, _) => TrackState::Confirmed,
+            (false, true) => TrackState::Tentative,
+            (false, false) if self.confirmed => TrackState::Lost,
+            (false, false) => TrackState::Tentative,
         }
     }
 

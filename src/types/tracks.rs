@@ -5,9 +5,9 @@ use super::{BBox, CameraId, CaptureTime, ClassId, Epoch, MediaTime, TrackId};
 /// A track's stage of life.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum TrackState {
-    /// Just born, not yet believed.
+    /// Not believed: just born, or matched to a detection that its past speaks against.
     Tentative,
-    /// Believed and in view (or missed for a moment so short that its box still stands).
+    /// Believed and in view, or missed for a moment in which its predicted box still stands.
     Confirmed,
     /// Believed, but not seen now; may be found again.
     Lost,

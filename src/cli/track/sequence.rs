@@ -38,7 +38,7 @@ fn track_one(sequence: &Sequence, linker: &Linker, job: &Job, out: &mut Output) 
         bar.set_position(frame as u64 + 1);
         Vec::new()
     };
-    let config = job.tracker.apply(TrackerConfig::default())?;
+    let config = job.tracker.apply(linker.calibrate(TrackerConfig::default()))?;
     let rows = replay(sequence, &config, embeddings, |request| linker.score_blocking(request.clone()))?;
     bar.finish_and_clear();
     out.write(&rows)?;
