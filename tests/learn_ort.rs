@@ -6,12 +6,61 @@ mod learn_common;
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::path::Path;
 use std::sync::Arc;
 
 use gakp::infer::{Linker, ModelSettings};
-use gakp::learn::{GruScorer, onnx};
+use gakp::learn::{GruScorer, LinkModel, onnx};
+use gakp::track::{Dense, EXISTENCE_FEATURES, ExistenceHead, TrackerConfig};
 use infer_support::{models, settings, sha256};
 use learn_common::{examples, model, request};
+
+/// Writes a link model with `metadata` and its manifest to `to`; settings that name it.
+fn write(to: &Path, models: &Path, model: &LinkModel, metadata: &BTreeMap<String, String>) -> ModelSettings {
+    let file = to.join("link.onnx");
+    fs::write(&file, onnx::write(model, "a test", metadata)).expect("written");
+    let manifest = to.join("manifest.toml");
+    let entry = format!(
+        "[[model]]\nname = \"link\"\ntask = \"link\"\nfamily = \"gru\"\nfile = \"link.onnx\"\n\
+         sha256 = \"{}\"\nlicense = \"none\"\n",
+        sha256(&file)
+    );
+    fs::write(&manifest, entry).expect("written");
+    ModelSettings {
+        manifest,
+        link: "link".into(),
+        onnxruntime: Some(models.join("cache/libonnxruntime.so")),
+        ..settings(models)
+    }
+}
+
+#[test]
+fn the_existence_head_travels_in_the_file() {
+    let Some(folder) = models() else { return };
+    let mut rng = fastrand::Rng::with_seed(19);
+    let model = model(8, &examples(30, &mut rng), &mut rng);
+    let layer = Dense { weights: vec![0.25; EXISTENCE_FEATURES], bias: vec![-0.5] };
+    let head = ExistenceHead::new([0.1; EXISTENCE_FEATURES], [3.0; EXISTENCE_FEATURES], vec![layer]);
+    let head = head.expect("a network");
+    for (text, expected) in [(head.to_string(), Ok(head)), ("13 1 0 7".into(), Err("ends early"))] {
+        let written = tempfile::tempdir().expect("a folder");
+        let metadata = BTreeMap::from([("existence".to_owned(), text)]);
+        let settings = write(written.path(), &folder, &model, &metadata);
+        match (Linker::load(&settings, Arc::new(())), expected) {
+            (Ok(linker), Ok(expected)) => {
+                let found = linker.calibrate(TrackerConfig::default()).existence.head;
+                assert_eq!(found.as_deref(), Some(&expected));
+                linker.shutdown();
+            }
+            (Err(error), Err(expected)) => {
+                let error = error.to_string();
+                assert!(error.contains("existence head") && error.contains(expected), "{error}");
+            }
+            (Ok(_), Err(_)) => panic!("a broken head is taken"),
+            (Err(error), Ok(_)) => panic!("{error}"),
+        }
+    }
+}
 
 #[test]
 fn onnx_runtime_equals_the_scorer() {
@@ -21,22 +70,9 @@ fn onnx_runtime_equals_the_scorer() {
     for hidden in [1, 32, 134] {
         let model = model(hidden, &raw, &mut rng);
         let written = tempfile::tempdir().expect("a folder");
-        let file = written.path().join("link.onnx");
-        fs::write(&file, onnx::write(&model, "a test", &BTreeMap::new())).expect("written");
-        let manifest = written.path().join("manifest.toml");
-        let entry = format!(
-            "[[model]]\nname = \"link\"\ntask = \"link\"\nfamily = \"gru\"\nfile = \"link.onnx\"\n\
-             sha256 = \"{}\"\nlicense = \"none\"\n",
-            sha256(&file)
-        );
-        fs::write(&manifest, entry).expect("written");
-        let settings = ModelSettings {
-            manifest,
-            link: "link".into(),
-            onnxruntime: Some(folder.join("cache/libonnxruntime.so")),
-            ..settings(&folder)
-        };
+        let settings = write(written.path(), &folder, &model, &BTreeMap::new());
         let linker = Linker::load(&settings, Arc::new(())).expect("ONNX Runtime takes the file");
+        assert!(linker.calibrate(TrackerConfig::default()).existence.head.is_none());
         let (mut scorer, mut expected) = (GruScorer::new(model), vec![]);
         for (tracks, pairs) in [(1, 1), (16, 40), (100, 400)] {
             let request = request(tracks, pairs, &mut rng);
