@@ -11,8 +11,8 @@
 //! | `huang` | [`huang`] | `ln(A_pos A_size A_appr)` (Huang 2008) | no |
 //! | `mahalanobis` | [`mahalanobis`] | gate less squared distance (Eq. Mahalanobis) | no |
 //!
-//! Each says what a gated pair is worth; [`matching`] takes the pairs of greatest total worth. All
-//! else (filter, camera motion, births, loss) is the same for all of them. [`gate`] differs for `iou`
+//! Each says what a gated pair is worth; [`match_pairs`] takes the pairs of greatest total worth. All
+//! else (filter, camera motion, births, loss) is the same for all of them. [`gate()`] differs for `iou`
 //! alone, which knows no motion.
 
 pub mod deep;
@@ -122,7 +122,7 @@ impl FromStr for Association {
 }
 
 /// Cosine of two people's embeddings: deep ReID networks give 0.4 to 0.5.
-const STRANGERS: f64 = 0.4;
+pub const STRANGERS: f64 = 0.4;
 
 /// What is known of a gated pair.
 #[derive(Clone, Copy, Debug)]
