@@ -11,7 +11,7 @@ use serde::Deserialize;
 use crate::api::NewCamera;
 use crate::detect::DetectorSettings;
 use crate::infer::ModelSettings;
-use crate::track::{PairScore, TrackerConfig};
+use crate::track::{Association, PairScore, TrackerConfig};
 
 /// The whole file.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize)]
@@ -80,6 +80,9 @@ pub struct TrackerOptions {
     pub lost_s: Option<f64>,
     /// Whether the camera may move.
     pub camera_motion: Option<bool>,
+    /// How pairs are judged: `iou`, `iou-motion`, `deep`, `explicit`, `explicit-fixed`, `implicit`, `huang`,
+    /// `mahalanobis`; see [`crate::track::association`].
+    pub association: Option<String>,
     /// `blend` (link probability and overlap) or `log-link` (the paper's `-ln P`).
     pub cost: Option<String>,
     /// `lambda_c` of Eq. Q* and R*.
@@ -186,6 +189,16 @@ fn default_manifest() -> PathBuf {
 }
 
 impl TrackerOptions {
+    /// `models` without the link scorer where the association asks none.
+    ///
+    /// # Errors
+    /// As [`TrackerOptions::apply`].
+    pub fn without_idle(&self, models: &ModelSettings) -> Result<ModelSettings> {
+        let asks = self.apply(TrackerConfig::default())?.association.method.asks_scorer();
+        let link = if asks { models.link.clone() } else { "none".into() };
+        Ok(ModelSettings { link, ..models.clone() })
+    }
+
     /// `base` with what these options change.
     ///
     /// # Errors
@@ -236,6 +249,9 @@ impl TrackerOptions {
         if let Some(moves) = self.camera_motion {
             base.shift.enabled = moves;
         }
+        if let Some(name) = &self.association {
+            base.association.method = name.parse::<Association>().context("tracker.association")?;
+        }
         match self.cost.as_deref() {
             None => {}
             Some("blend") => base.association.score = PairScore::Blend { iou_weight: 0.3 },
@@ -283,6 +299,7 @@ mod tests {
             lost_s = 3.0
             coast_s = 2.5
             cost = "log-link"
+            association = "huang"
             [[camera]]
             id = "gate"
             url = "rtsp://user:secret@10.0.0.2/stream1"
@@ -299,6 +316,7 @@ mod tests {
         let tracker = config.tracker.apply(TrackerConfig::default()).unwrap();
         assert_eq!((tracker.life.lost, tracker.life.coast), (3.0, 2.5));
         assert_eq!(tracker.association.score, PairScore::LogLink);
+        assert_eq!(tracker.association.method, Association::Huang);
     }
 
     #[test]
@@ -313,6 +331,7 @@ mod tests {
             ),
             ("[tracker]\nhigh_score = 7", "tracker.high_score = 7: must be from 0 to 1"),
             ("[tracker]\ncost = \"x\"", "must be \"blend\" or \"log-link\""),
+            ("[tracker]\nassociation = \"gru\"", "tracker.association: \"gru\" is no association: use iou, "),
             ("[tracker]\nlost_s = nan", "tracker.lost_s"),
             ("listen = \"here\"", "invalid socket address"),
         ] {

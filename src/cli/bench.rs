@@ -102,6 +102,7 @@ fn pipeline(args: PipelineArgs) -> Result<()> {
         models: settings.clone(),
         frames: None,
         second_half: false,
+        features: false,
         video: None,
     };
     let rounds = (0..args.rounds)

@@ -1,6 +1,8 @@
 //! The command line: one file a subcommand.
 
 #[cfg(feature = "service")]
+pub mod ablate;
+#[cfg(feature = "service")]
 pub mod bench;
 #[cfg(feature = "testcam")]
 pub mod camera;
@@ -44,6 +46,9 @@ pub enum Command {
     Track(track::Args),
     /// Score result files against MOTChallenge ground truth.
     Eval(eval::Args),
+    /// Track sequences with every association of the paper, and print its table.
+    #[cfg(feature = "service")]
+    Ablate(ablate::Args),
     /// Serve a video as a real RTSP camera, over and over.
     #[cfg(feature = "testcam")]
     Camera(camera::Args),
@@ -67,6 +72,8 @@ pub fn run(cli: Cli) -> anyhow::Result<()> {
         #[cfg(feature = "service")]
         Command::Track(args) => track::run(args),
         Command::Eval(args) => eval::run(args),
+        #[cfg(feature = "service")]
+        Command::Ablate(args) => ablate::run(args),
         #[cfg(feature = "testcam")]
         Command::Camera(args) => camera::run(args),
         #[cfg(feature = "service")]

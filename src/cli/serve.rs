@@ -162,10 +162,11 @@ struct Service {
 async fn start(plan: Plan) -> Result<Service> {
     let metrics = Metrics::new().context("cannot set up the metrics")?;
     // Loading models takes seconds on a GPU and blocks.
-    let (settings, observer) = (plan.models, metrics.clone());
+    let (settings, observer) = (plan.tracker.without_idle(&plan.models)?, metrics.clone());
     let models = tokio::task::spawn_blocking(move || Models::load(&settings, observer)).await??;
     metrics.provider(models.report.provider);
     let tracker = plan.tracker.apply(models.calibrate(TrackerConfig::default()))?;
+    models.check_suits(tracker.association.method)?;
     let hub = Hub::new(HubConfig::default(), models.detector.classes().into());
     hub.metrics().register(metrics.registry())?;
     let lanes = Lanes::start(models, metrics.clone())?;

@@ -13,12 +13,10 @@ use sha2::{Digest, Sha256};
 
 use crate::learn::card::{Card, MOTCHALLENGE_LICENCE, Unseen};
 use crate::learn::dataset::{self, LabelledSequence};
-use crate::learn::{
-    Boxes, Examples, Fit, GruScorer, HeadFit, LinkModel, Recipe, Teacher, fit, fit_head, logits, metrics,
-    onnx,
-};
+use crate::learn::network::{Network, Scorer};
+use crate::learn::{Boxes, Examples, Fit, HeadFit, Recipe, Teacher, fit_head, metrics};
 use crate::mot::{Benchmark, Row, Sequence, SequenceInfo, evaluate, first_half_length, parse_truth, replay};
-use crate::track::{ExistenceHead, TrackerConfig};
+use crate::track::{Association, ExistenceHead, TrackerConfig};
 
 /// Trains the network that says how probable it is that a detection continues a track.
 ///
@@ -43,6 +41,10 @@ pub struct Args {
     /// on the first).
     #[arg(long, value_name = "SUFFIX")]
     pub second_half: Vec<String>,
+    /// What to train: the GRU that gives the probability itself, or the one that gives the weights of
+    /// explicit features.
+    #[arg(long, value_name = "NAME", default_value = "implicit", value_parser = ["implicit", "explicit"])]
+    pub association: String,
     /// Seed of everything random.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
@@ -167,7 +169,7 @@ fn train(
         threads: args.threads.or_else(|| thread::available_parallelism().ok().map(usize::from)).unwrap_or(1),
         ..Fit::default()
     };
-    let model = run_fit(&settings, &examples, &name);
+    let model = run_fit(args.association.parse()?, &settings, &examples, &name);
     let boxes = boxes(&model, &seen, &args.second_half, &name)?;
     ensure!(!boxes.is_empty(), "the tracker confirms no track in the training sequences");
     let head_fit = HeadFit { seed: args.seed, ..HeadFit::default() };
@@ -195,8 +197,9 @@ fn train(
         file: name,
         bytes: 0,
         licence: args.licence.clone(),
+        explicit: model.association() == Association::Explicit,
         hidden: settings.hidden,
-        parameters: model.gru.theta.len(),
+        parameters: model.parameters(),
         sequences: names(&seen),
         excluded: names(&held),
         examples: (examples.len(), examples.positive_share()),
@@ -209,17 +212,20 @@ fn train(
     metadata.insert("existence".into(), head.to_string());
     metadata.insert("sequences".into(), card.sequences.join(" "));
     metadata.insert("excluded".into(), card.excluded.join(" "));
-    let bytes = onnx::write(&model, "Probability that a detection continues a track", &metadata);
+    if card.explicit {
+        metadata.insert("association".into(), args.association.clone());
+    }
+    let bytes = model.write("Probability that a detection continues a track", &metadata);
     card.bytes = bytes.len();
     write(out, &bytes)?;
     write(&out.with_extension("md"), card.markdown().as_bytes())?;
-    write(&out.with_extension("toml"), manifest(out, &bytes, &args.licence)?.as_bytes())?;
+    write(&out.with_extension("toml"), manifest(out, &bytes, &args.licence, model.family())?.as_bytes())?;
     println!("wrote {} ({} examples)", out.display(), examples.len());
     Ok(scores)
 }
 
 /// A manifest of this one network, so that `--link OUT.onnx` takes it.
-fn manifest(out: &Path, bytes: &[u8], licence: &str) -> Result<String> {
+fn manifest(out: &Path, bytes: &[u8], licence: &str, family: &str) -> Result<String> {
     #[derive(Serialize)]
     struct Entry<'a> {
         name: &'a str,
@@ -233,7 +239,7 @@ fn manifest(out: &Path, bytes: &[u8], licence: &str) -> Result<String> {
     let entry = Entry {
         name: out.file_stem().and_then(|n| n.to_str()).unwrap_or("link"),
         task: "link",
-        family: "gru",
+        family,
         file: out.file_name().and_then(|n| n.to_str()).unwrap_or("link.onnx"),
         sha256: Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect(),
         license: licence.lines().next().unwrap_or_default(),
@@ -251,10 +257,10 @@ fn collect(recipe: &Recipe, seen: &[&Source], name: &str) -> Examples {
     examples
 }
 
-fn run_fit(settings: &Fit, examples: &Examples, name: &str) -> LinkModel {
+fn run_fit(association: Association, settings: &Fit, examples: &Examples, name: &str) -> Network {
     let mut mean = f64::NAN;
     let bar = bar(0, "{msg} {wide_bar} {pos}/{len} {eta}");
-    let model = fit(examples, settings, |p| {
+    let model = Network::fit(association, examples, settings, |p| {
         bar.set_length(p.steps as u64);
         mean = if mean.is_nan() { p.loss } else { mean + 0.02 * (p.loss - mean) };
         bar.set_message(format!("{name}: cross-entropy {mean:.4}"));
@@ -289,14 +295,16 @@ fn counted(source: &Source, second_half: &[String]) -> Result<(bool, LabelledSeq
 }
 
 /// What the tracker puts out on the sequences that the network was trained on.
-fn boxes(model: &LinkModel, seen: &[&Source], second_half: &[String], name: &str) -> Result<Boxes> {
+fn boxes(model: &Network, seen: &[&Source], second_half: &[String], name: &str) -> Result<Boxes> {
     let bar = bar(seen.len() as u64, "{msg} {wide_bar} {pos}/{len}");
     bar.set_message(format!("{name}: boxes"));
-    let mut scorer = GruScorer::new(model.clone());
+    let mut scorer = Scorer::new(model.clone());
+    let mut config = TrackerConfig::default();
+    config.association.method = model.association();
     let mut boxes = Boxes::default();
     for source in seen {
         let (_, sequence, truth) = counted(source, second_half)?;
-        boxes.collect(&sequence, &truth, &TrackerConfig::default(), |request| {
+        boxes.collect(&sequence, &truth, &config, |request| {
             let mut links = vec![];
             scorer.score(request, &mut links);
             links
@@ -309,7 +317,7 @@ fn boxes(model: &LinkModel, seen: &[&Source], second_half: &[String], name: &str
 
 /// Pairs and tracks of a sequence under a network and a head that have not seen it.
 fn score(
-    model: &LinkModel,
+    model: &Network,
     head: &Arc<ExistenceHead>,
     source: &Source,
     second_half: &[String],
@@ -318,7 +326,7 @@ fn score(
     let length = counted.frames.len() as u32;
     let mut pairs = Examples::default();
     Teacher::natural().collect(&counted, &mut fastrand::Rng::with_seed(0), &mut pairs);
-    let link = metrics::scores(&logits(model, &pairs), pairs.labels(), pairs.weights());
+    let link = metrics::scores(&model.logits(&pairs), pairs.labels(), pairs.weights());
 
     let sequence = Sequence {
         info: SequenceInfo {
@@ -330,13 +338,14 @@ fn score(
         },
         detections: counted.frames.iter().map(|f| f.detections.clone()).collect(),
     };
-    let mut scorer = GruScorer::new(model.clone());
+    let mut scorer = Scorer::new(model.clone());
     let links = |request: &_| {
         let mut links = vec![];
         scorer.score(request, &mut links);
         Ok::<_, Infallible>(links)
     };
     let mut config = TrackerConfig::default();
+    config.association.method = model.association();
     config.existence.head = Some(head.clone());
     let rows = replay(&sequence, &config, |_| vec![], links)?;
     let tracks = evaluate(&truth, &rows, length, Benchmark::of(&counted.name, &truth))

@@ -59,6 +59,23 @@ pub enum InferError {
         /// What disagrees.
         reason: String,
     },
+    /// A link scorer of one association under the name of another.
+    #[error(
+        "model {name:?} is no network of the association {association:?}: \
+         set --link (models.link) to one, or tracker.association to what it is"
+    )]
+    Association {
+        /// Its name in the manifest.
+        name: String,
+        /// The association that was asked for.
+        association: &'static str,
+    },
+    /// No link scorer for an association that asks one.
+    #[error("the association {association:?} needs a link scorer: set --link (models.link) to one")]
+    NoLinker {
+        /// The association.
+        association: &'static str,
+    },
     /// ONNX Runtime itself could not be loaded.
     #[error(
         "ONNX Runtime cannot be loaded; {FETCH}, or point ORT_DYLIB_PATH at libonnxruntime.so. Tried: {tried}"

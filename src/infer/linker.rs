@@ -15,10 +15,12 @@ use ort::session::Session;
 use ort::value::{TensorElementType, TensorRef};
 
 use super::graph::check_type;
-use super::manifest::ModelEntry;
+use super::manifest::{Family, ModelEntry};
 use super::runtime::Runtime;
 use super::{Arrangement, BatchModel, Batcher, InferError, Observer, Task};
-use crate::track::{CANDIDATE_FEATURES, ExistenceHead, HISTORY, LinkRequest, STEP_FEATURES, TrackerConfig};
+use crate::track::{
+    Association, CANDIDATE_FEATURES, ExistenceHead, HISTORY, LinkRequest, STEP_FEATURES, TrackerConfig,
+};
 
 const MODEL: &str = Task::Link.as_str();
 const INPUTS: [(&str, TensorElementType); 4] = [
@@ -36,6 +38,8 @@ const EXISTENCE: &str = "existence";
 pub struct Linker {
     batcher: Arc<Batcher<LinkModel>>,
     existence: Option<Arc<ExistenceHead>>,
+    name: Arc<str>,
+    family: Family,
 }
 
 impl Linker {
@@ -56,13 +60,34 @@ impl Linker {
             model.run(&[warm_up()])?;
             Ok(model)
         })?;
-        Ok(Self { batcher: Arc::new(batcher), existence: existence.get().cloned().flatten() })
+        Ok(Self {
+            batcher: Arc::new(batcher),
+            name: entry.name.as_str().into(),
+            family: entry.family,
+            existence: existence.get().cloned().flatten(),
+        })
     }
 
     /// `tracker` with the existence head that the model's file carries, if it does.
     pub fn calibrate(&self, mut tracker: TrackerConfig) -> TrackerConfig {
         tracker.existence.head = self.existence.clone();
         tracker
+    }
+
+    /// Whether its probabilities are those that `association` is named after.
+    ///
+    /// # Errors
+    /// [`InferError::Association`]: it is a network of another association.
+    pub fn check_suits(&self, association: Association) -> Result<(), InferError> {
+        let wanted = match association {
+            Association::Implicit => Family::Gru,
+            Association::Explicit => Family::Explicit,
+            _ => return Ok(()),
+        };
+        if self.family == wanted {
+            return Ok(());
+        }
+        Err(InferError::Association { name: self.name.to_string(), association: association.as_str() })
     }
 
     /// The probabilities of a request's pairs, in their order, each in `[0, 1]`. An empty request is

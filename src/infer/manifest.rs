@@ -87,8 +87,10 @@ pub enum Family {
     Yolov8,
     /// `[N, D]`: an appearance vector.
     Embedding,
-    /// `[P]`: a probability a pair.
+    /// `[P]`: a probability a pair, by a GRU over history and candidate.
     Gru,
+    /// `[P]`: a probability a pair, from explicit features whose weights a GRU over the history gives.
+    Explicit,
 }
 
 impl Family {
@@ -96,7 +98,7 @@ impl Family {
         match self {
             Family::Nanodet | Family::Yolox | Family::Yolov8 => Task::Detect,
             Family::Embedding => Task::Reid,
-            Family::Gru => Task::Link,
+            Family::Gru | Family::Explicit => Task::Link,
         }
     }
 }

@@ -9,7 +9,7 @@ use super::{
 };
 use crate::detect::{Detector, DetectorSettings};
 use crate::embed::Embedder;
-use crate::track::TrackerConfig;
+use crate::track::{Association, TrackerConfig};
 
 /// What the user says about models.
 #[derive(Clone, Debug)]
@@ -152,6 +152,20 @@ impl Models {
         match &self.linker {
             Some(linker) => linker.calibrate(tracker),
             None => tracker,
+        }
+    }
+
+    /// Checks that the link scorer is one that `association` can use, if it asks one.
+    ///
+    /// # Errors
+    /// [`InferError::NoLinker`] or [`InferError::Association`].
+    pub fn check_suits(&self, association: Association) -> Result<(), InferError> {
+        match &self.linker {
+            Some(linker) => linker.check_suits(association),
+            None if association.asks_scorer() => {
+                Err(InferError::NoLinker { association: association.as_str() })
+            }
+            None => Ok(()),
         }
     }
 

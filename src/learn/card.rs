@@ -11,6 +11,8 @@ pub struct Card {
     pub bytes: usize,
     /// Licence of the data, and what follows for the weights.
     pub licence: String,
+    /// Whether it gives the weights of explicit features instead of the probability itself.
+    pub explicit: bool,
     /// Width of the hidden state.
     pub hidden: usize,
     /// Number of parameters.
@@ -69,7 +71,7 @@ impl Card {
             out,
             "# {}: link network\n\n\
              Says how probable it is that a detection continues a track, from up to 6 observations of the \
-             track and the detection. A GRU of {} units, the reset gate before the matrix product, {} \
+             track and the detection. A GRU of {} units, the reset gate before the matrix product{}, {} \
              parameters, {} bytes of ONNX. Boxes only: it sees neither pixels nor the place in the picture. \
              Written by `gakp train`.\n\n\
              ## Licence of the data\n{}\n\n\
@@ -82,7 +84,17 @@ impl Card {
              | out | `probability` | f32 `[P]` |\n\n\
              The features are those of `src/track/features.rs`, raw: normalisation is in the graph. T and P \
              must be at least 1.\n\n",
-            self.file, self.hidden, self.parameters, self.bytes, self.licence
+            self.file,
+            self.hidden,
+            if self.explicit {
+                ", over the track alone: it gives the weights of four explicit features of the pair, and the \
+                 probability is the logistic function of their weighted sum"
+            } else {
+                ""
+            },
+            self.parameters,
+            self.bytes,
+            self.licence
         );
         let _ =
             writeln!(out, "## Data\nSequences ({}): {}.", self.sequences.len(), self.sequences.join(", "));

@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+pub use crate::mot::footage as group;
 use crate::mot::{Row, RowError, SeqInfoError, Sequence, SequenceInfo, parse_truth};
 use crate::track::assign::assign;
 use crate::types::{BBox, Detection, MediaTime};
@@ -91,17 +92,6 @@ pub enum DatasetError {
         .0.display()
     )]
     Empty(PathBuf),
-}
-
-/// The footage of a sequence's name: MOT16 and MOT17 publish one sequence under the names
-/// `MOT17-02-DPM`, `MOT17-02-SDP`, and so on. Whoever holds out a sequence must hold out all of them.
-pub fn group(name: &str) -> &str {
-    let mut parts = name.match_indices('-');
-    let second = parts.nth(1);
-    match (name.starts_with("MOT"), second) {
-        (true, Some((at, _))) => &name[..at],
-        _ => name,
-    }
 }
 
 /// The folders of the sequences under `root` (or `root` itself, when it is one), in the order of

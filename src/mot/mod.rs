@@ -9,10 +9,12 @@
 //! Pure: text and numbers in, text and numbers out. `cli` reads and writes the files.
 
 mod clear;
+mod embeddings;
 mod hota;
 mod identity;
 mod matching;
 mod matrix;
+mod npy;
 mod preprocess;
 mod replay;
 mod rows;
@@ -21,8 +23,10 @@ mod seqinfo;
 mod sequence;
 
 pub use clear::Clear;
+pub use embeddings::{FeatureError, SequenceEmbeddings};
 pub use hota::{ALPHAS, Hota};
 pub use identity::Identity;
+pub use npy::{Matrix, NpyError, parse_npy};
 pub use preprocess::{Benchmark, EvalError};
 pub use replay::{replay, report_rows, result_rows};
 pub use rows::{
@@ -31,4 +35,4 @@ pub use rows::{
 };
 pub use score::{Score, evaluate};
 pub use seqinfo::{SeqInfoError, SequenceInfo};
-pub use sequence::{Sequence, first_half_length, second_half};
+pub use sequence::{Sequence, first_half_length, footage, second_half};

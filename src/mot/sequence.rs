@@ -40,6 +40,17 @@ impl Sequence {
     }
 }
 
+/// The footage of a sequence's name: MOT16 and MOT17 publish one sequence under the names
+/// `MOT17-02-DPM`, `MOT17-02-SDP`, and so on. Whoever holds out a sequence must hold out all of them.
+pub fn footage(name: &str) -> &str {
+    let mut parts = name.match_indices('-');
+    let second = parts.nth(1);
+    match (name.starts_with("MOT"), second) {
+        (true, Some((at, _))) => &name[..at],
+        _ => name,
+    }
+}
+
 /// Frames that make the first half of a sequence of `length` frames: what detectors such as YOLOX were
 /// trained on. Frames after `length / 2 + 1` are the second half.
 pub fn first_half_length(length: u32) -> u32 {

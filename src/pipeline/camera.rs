@@ -31,18 +31,18 @@ pub struct Lanes {
     models: Models,
     metrics: Arc<Metrics>,
     tracker: TrackerThread,
-    link: JoinHandle<()>,
+    link: Option<JoinHandle<()>>,
 }
 
 impl Lanes {
-    /// Starts the shared stages, sink first. Needs a tokio runtime.
+    /// Starts the shared stages, sink first. Needs a tokio runtime. Models without a link scorer suit
+    /// cameras whose association asks none ([`crate::track::Association::asks_scorer`]).
     pub fn start(models: Models, metrics: Arc<Metrics>) -> std::io::Result<Self> {
-        let Some(linker) = models.linker.clone() else {
-            return Err(std::io::Error::other("tracking needs a link scorer: set models.link to one"));
-        };
         let (jobs, job_queue) = mpsc::channel(MAX_CAMERAS);
         let (tracker, answers) = TrackerThread::start(jobs, metrics.clone())?;
-        let link = tokio::spawn(link::run(job_queue, linker, answers.downgrade()));
+        // Without a scorer (an association that asks none) there is nobody to send jobs to, and none are.
+        let stage = |linker| tokio::spawn(link::run(job_queue, linker, answers.downgrade()));
+        let link = models.linker.clone().map(stage);
         Ok(Self { models, metrics, tracker, link })
     }
 
@@ -58,7 +58,9 @@ impl Lanes {
         if tokio::task::spawn_blocking(move || tracker.join()).await.is_err() {
             tracing::error!("joining the tracker's thread failed");
         }
-        if link.await.is_err() {
+        if let Some(link) = link
+            && link.await.is_err()
+        {
             tracing::error!("the link stage panicked");
         }
         if tokio::task::spawn_blocking(move || models.shutdown()).await.is_err() {

@@ -5,7 +5,9 @@
 
 use std::sync::Arc;
 
+use super::association::Association;
 use super::existence::ExistenceHead;
+use super::tracklet::Tracklet;
 
 /// All settings of a [`super::Tracker`].
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -140,7 +142,9 @@ pub enum PairScore {
 /// From pairs to matches.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AssociationConfig {
-    /// What is maximised.
+    /// How a pair is judged.
+    pub method: Association,
+    /// What is maximised, for [`Association::Implicit`].
     pub score: PairScore,
     /// Detections below this score do not take part in the first stages.
     pub high_score: f64,
@@ -166,6 +170,7 @@ pub struct AssociationConfig {
 impl Default for AssociationConfig {
     fn default() -> Self {
         Self {
+            method: Association::default(),
             score: PairScore::Blend { iou_weight: 0.3 },
             high_score: 0.55,
             low_score: 0.1,
@@ -177,6 +182,19 @@ impl Default for AssociationConfig {
             second_stage_within: 0.0,
             second_stage_iou: 0.5,
         }
+    }
+}
+
+impl AssociationConfig {
+    /// Least score of a match with a confirmed or a tentative track.
+    pub fn least(&self, confirmed: bool) -> f64 {
+        if confirmed { self.min_score } else { self.min_score_tentative }
+    }
+
+    /// The link probability that a match with `track` must have more than.
+    pub fn min_link_of(&self, track: &Tracklet) -> f64 {
+        let waited = (track.missed_for() / self.min_link_after).clamp(0.0, 1.0);
+        self.min_link + (self.min_link_lost - self.min_link) * waited
     }
 }
 
@@ -197,6 +215,14 @@ pub struct AppearanceConfig {
 impl Default for AppearanceConfig {
     fn default() -> Self {
         Self { weight: 0.0, pivot: 0.8, learning_rate: 0.1, max_overlap: 0.3 }
+    }
+}
+
+impl AppearanceConfig {
+    /// For embeddings of a deep ReID network that nothing else is known of: these have cosines of 0.8
+    /// to 0.95 for one person and 0.4 to 0.5 for two.
+    pub fn deep() -> Self {
+        Self { weight: 10.0, pivot: 0.65, ..Self::default() }
     }
 }
 

@@ -25,6 +25,17 @@ use super::link::{CANDIDATE_FEATURES, HISTORY, STEP_FEATURES};
 use super::tracklet::{Observation, Tracklet, innovation};
 use crate::types::{BBox, Detection, MediaTime};
 
+/// Index of the seconds since the observation before.
+pub const DT: usize = 6;
+/// Index of the first of four innovations.
+pub const INNOVATION: usize = 8;
+/// Index of a candidate's IoU with the predicted box.
+pub const IOU: usize = STEP_FEATURES;
+/// Index of a candidate's Mahalanobis distance.
+pub const MAHALANOBIS: usize = STEP_FEATURES + 1;
+/// What the Mahalanobis distance is given in units of.
+pub const MAHALANOBIS_UNIT: f64 = 5.0;
+
 /// Velocities are clamped to this, heights per second: two boxes a millisecond apart say nothing.
 const MAX_VELOCITY: f64 = 20.0;
 
@@ -103,7 +114,7 @@ pub fn candidate(
     features[STEP_FEATURES..].copy_from_slice(
         &[
             geometry.iou,
-            geometry.mahalanobis2.sqrt() / 5.0,
+            geometry.mahalanobis2.sqrt() / MAHALANOBIS_UNIT,
             (std_x / predicted.h).ln(),
             f64::from(track.hits.min(20)) / 20.0,
             track.missed_for(),

@@ -10,11 +10,11 @@
 //! clock, thread, file, random source or model; time is an argument.
 //!
 //! One concept a file, in the order of a frame: [`motion`] and [`kalman`] predict, [`shift`]
-//! follows the camera, [`gate`] picks the pairs, [`features`] describes them, `association`
+//! follows the camera, [`gate`] picks the pairs, [`features`] describes them, [`association`]
 //! and [`assign`] match them, [`tracklet`] lives and dies, [`existence`] says what is shown.
 
 pub mod assign;
-mod association;
+pub mod association;
 mod config;
 pub mod existence;
 pub mod features;
@@ -26,7 +26,7 @@ pub mod shift;
 mod tracker;
 pub mod tracklet;
 
-pub use association::{Match, match_pairs};
+pub use association::{Association, Match, match_pairs};
 pub use config::{
     AppearanceConfig, AssociationConfig, BirthConfig, ExistenceConfig, FilterConfig, GateConfig, LifeConfig,
     NoiseAdaptation, PairScore, ShiftConfig, TrackerConfig,

@@ -1,10 +1,10 @@
 //! The tracker of one camera: predict, then update, once a frame.
 
-use super::association::{Match, match_pairs};
-use super::config::{ExistenceConfig, PairScore, TrackerConfig};
+use super::association::{self, Affinity, Match, PairView, match_pairs};
+use super::config::{ExistenceConfig, TrackerConfig};
 use super::existence;
 use super::features;
-use super::gate::{PairGeometry, gate};
+use super::gate::PairGeometry;
 use super::link::{LinkRequest, Pair};
 use super::shift::global_shift;
 use super::tracklet::Tracklet;
@@ -160,15 +160,19 @@ impl Tracker {
         if !self.awaiting {
             return Err(TrackError::NoFrame);
         }
-        if links.len() != self.pairs.len() {
-            return Err(TrackError::ScoreCount { expected: self.pairs.len(), got: links.len() });
+        let asked = self.config.association.method.asks_scorer();
+        let expected = if asked { self.pairs.len() } else { 0 };
+        if links.len() != expected {
+            return Err(TrackError::ScoreCount { expected, got: links.len() });
         }
-        let links: Vec<f64> = self.pairs.iter().zip(links).map(|(pair, p)| self.link(pair, *p)).collect();
+        let worth: Vec<Option<Affinity>> = (0..self.pairs.len())
+            .map(|index| self.affinity(&self.pairs[index], links.get(index).copied()))
+            .collect();
         let mut matches = Vec::new();
         let mut track_taken = vec![false; self.tracks.len()];
         let mut detection_taken = vec![false; self.detections.len()];
         for confirmed in [true, false] {
-            self.match_stage(confirmed, &links, &mut matches, &mut track_taken, &mut detection_taken);
+            self.match_stage(confirmed, &worth, &mut matches, &mut track_taken, &mut detection_taken);
         }
         self.match_low_scores(&mut matches, &mut track_taken, &mut detection_taken);
         let births = self.births(&matches, &detection_taken);
@@ -286,6 +290,7 @@ impl Tracker {
     fn gate_pairs(&mut self, request: &mut LinkRequest) {
         request.clear();
         self.pairs.clear();
+        let asks = self.config.association.method.asks_scorer();
         for (index, (track, predicted)) in self.tracks.iter().zip(&self.predicted).enumerate() {
             let r = track.measurement_noise(&self.config.filter);
             let first = self.pairs.len();
@@ -293,85 +298,62 @@ impl Tracker {
                 if detection.score < self.config.association.high_score || detection.class != track.class {
                     continue;
                 }
-                let open = gate(&self.config.gate, &track.filter, predicted, r, &detection.bbox);
+                let open = association::gate(&self.config, track, predicted, r, &detection.bbox);
                 if let Some(geometry) = open {
-                    let pair = Pair { track: request.lengths.len() as u32, detection: d as u32 };
-                    request.pairs.push(pair);
-                    request.candidates.extend(features::candidate(track, predicted, detection, &geometry));
+                    if asks {
+                        let pair = Pair { track: request.lengths.len() as u32, detection: d as u32 };
+                        request.pairs.push(pair);
+                        request
+                            .candidates
+                            .extend(features::candidate(track, predicted, detection, &geometry));
+                    }
                     self.pairs.push(GatedPair { track: index, detection: d, geometry });
                 }
             }
-            if self.pairs.len() > first {
+            if asks && self.pairs.len() > first {
                 let valid = features::push_history(track, &mut request.histories);
                 request.lengths.push(valid as i32);
             }
         }
     }
 
-    /// The scorer's probability, moved by appearance where both sides have one.
-    fn link(&self, pair: &GatedPair, probability: f32) -> f64 {
-        let p = if probability.is_finite() { f64::from(probability).clamp(0.0, 1.0) } else { 0.0 };
-        let config = &self.config.appearance;
-        let (Some(a), Some(b)) = (
-            &self.tracks[pair.track].appearance,
-            self.embeddings.get(pair.detection).and_then(Option::as_ref),
-        ) else {
-            return p;
+    /// What a match of `pair` is worth; `None` when it must not be.
+    fn affinity(&self, pair: &GatedPair, probability: Option<f32>) -> Option<Affinity> {
+        let view = PairView {
+            track: &self.tracks[pair.track],
+            predicted: &self.predicted[pair.track],
+            detection: &self.detections[pair.detection],
+            embedding: self.embeddings.get(pair.detection).and_then(Option::as_ref),
+            geometry: &pair.geometry,
         };
-        if config.weight == 0.0 {
-            return p;
-        }
-        let p = p.clamp(1e-6, 1.0 - 1e-6);
-        let logit = (p / (1.0 - p)).ln() + config.weight * (a.cosine(b) - config.pivot);
-        1.0 / (1.0 + (-logit).exp())
-    }
-
-    /// How much a match of `pair` is worth; `None` when it must not be.
-    fn gain(&self, pair: &GatedPair, link: f64) -> Option<f64> {
-        let config = &self.config.association;
-        let track = &self.tracks[pair.track];
-        let waited = (track.missed_for() / config.min_link_after).clamp(0.0, 1.0);
-        let min_link = config.min_link + (config.min_link_lost - config.min_link) * waited;
-        if link <= min_link {
-            return None;
-        }
-        let gain = match config.score {
-            PairScore::LogLink => link.ln() - min_link.max(1e-6).ln(),
-            PairScore::Blend { iou_weight } => {
-                let score = self.detections[pair.detection].score;
-                let overlap = pair.geometry.iou * (0.7 + 0.3 * score);
-                let least = if track.confirmed { config.min_score } else { config.min_score_tentative };
-                iou_weight * overlap + (1.0 - iou_weight) * link - least
-            }
-        };
-        (gain > 0.0).then_some(gain)
+        association::affinity(&self.config, &view, probability)
     }
 
     fn match_stage(
         &self,
         confirmed: bool,
-        links: &[f64],
+        worth: &[Option<Affinity>],
         matches: &mut Vec<Match>,
         track_taken: &mut [bool],
         detection_taken: &mut [bool],
     ) {
         let mut allowed = Vec::new();
         let mut source = Vec::new();
-        for (index, (pair, &link)) in self.pairs.iter().zip(links).enumerate() {
+        for (index, (pair, worth)) in self.pairs.iter().zip(worth).enumerate() {
             if self.tracks[pair.track].confirmed != confirmed || detection_taken[pair.detection] {
                 continue;
             }
-            if let Some(gain) = self.gain(pair, link) {
+            if let Some(Affinity { gain, link }) = *worth {
                 allowed.push((pair.track, pair.detection, gain));
-                source.push(index);
+                source.push((index, link));
             }
         }
         for chosen in match_pairs(&allowed, self.tracks.len(), self.detections.len()) {
-            let index = source[chosen];
+            let (index, link) = source[chosen];
             let GatedPair { track, detection, .. } = self.pairs[index];
             track_taken[track] = true;
             detection_taken[detection] = true;
-            matches.push(Match { track, detection, link: links[index] });
+            matches.push(Match { track, detection, link });
         }
     }
 
@@ -386,6 +368,7 @@ impl Tracker {
         if config.second_stage_within <= 0.0 {
             return;
         }
+        let motion = config.method.uses_motion();
         let mut allowed = Vec::new();
         for (d, detection) in self.detections.iter().enumerate() {
             if detection.score >= config.high_score {
@@ -397,7 +380,8 @@ impl Tracker {
                     && track.class == detection.class
                     && track.missed_for() <= config.second_stage_within;
                 if waiting {
-                    let iou = self.predicted[t].iou(&detection.bbox);
+                    let place = if motion { &self.predicted[t] } else { &track.last().bbox };
+                    let iou = place.iou(&detection.bbox);
                     if iou > config.second_stage_iou {
                         allowed.push((t, d, iou));
                     }

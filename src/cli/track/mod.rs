@@ -37,6 +37,10 @@ pub struct Args {
     /// Of a MOTChallenge sequence, track frames after L/2 + 1, renumbered from 1.
     #[arg(long)]
     second_half: bool,
+    /// Of a MOTChallenge sequence, use the appearance vectors in det/det_features.npy (a row a row of
+    /// det.txt).
+    #[arg(long)]
+    features: bool,
     /// Configuration file: its [models] and [tracker] hold here too.
     #[arg(long, short, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -50,6 +54,7 @@ pub(super) struct Job {
     pub models: ModelSettings,
     pub frames: Option<u64>,
     pub second_half: bool,
+    pub features: bool,
     pub video: Option<PathBuf>,
 }
 
@@ -64,6 +69,7 @@ pub fn run(args: Args) -> Result<()> {
         models: ModelConfig::from(args.models).or(config.models).settings()?,
         frames: args.frames,
         second_half: args.second_half,
+        features: args.features,
         video: args.video,
     };
     let folders = args.inputs.iter().filter(|input| Path::new(input).is_dir()).count();
@@ -77,6 +83,9 @@ pub fn run(args: Args) -> Result<()> {
         [input] if folders == 0 => {
             if job.second_half {
                 bail!("--second-half is for MOTChallenge sequence folders");
+            }
+            if job.features {
+                bail!("--features is for MOTChallenge sequence folders: a video's come from --reid");
             }
             let mut out = Output::create(&args.out)?;
             video::track(input, &job, &mut out).map(|_| ())

@@ -34,8 +34,9 @@ pub fn track(input: &str, job: &Job, out: &mut Output) -> Result<Tracked> {
     spec.pacing = Pacing::AsFastAsPossible;
     spec.check()?;
     let metrics = Metrics::new()?;
-    let models = Models::load(&job.models, metrics.clone())?;
+    let models = Models::load(&job.tracker.without_idle(&job.models)?, metrics.clone())?;
     let tracker = job.tracker.apply(models.calibrate(TrackerConfig::default()))?;
+    models.check_suits(tracker.association.method)?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .thread_name("async")
         .worker_threads(1)

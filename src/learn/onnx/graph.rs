@@ -21,18 +21,46 @@ pub(super) const V0: &str = "readout.v0";
 
 /// The graph under construction.
 #[derive(Default)]
-struct Builder {
+pub(super) struct Builder {
     graph: GraphProto,
 }
 
 impl Builder {
-    fn floats(&mut self, name: &str, dims: &[usize], values: &[f32]) {
+    pub(super) fn new(name: &str) -> Self {
+        let mut b = Self::default();
+        b.graph.name = Some(name.into());
+        b.floats("clip.low", &[], &[-CLIP]);
+        b.floats("clip.high", &[], &[CLIP]);
+        b
+    }
+
+    /// The graph with the inputs and the output that every link network has.
+    pub(super) fn finish(mut self) -> GraphProto {
+        let (t, p) = (Dim::Named("T"), Dim::Named("P"));
+        let [float, int32, int64] = [data_type::FLOAT, data_type::INT32, data_type::INT64];
+        self.graph.input = vec![
+            value(
+                "histories",
+                float,
+                &[t, Dim::Fixed(HISTORY), Dim::Fixed(STEP_FEATURES)],
+                "observations of each track, oldest first, packed from index 0",
+            ),
+            value("lengths", int32, &[Dim::Named("T")], "valid observations of each track, 1 to 6"),
+            value("candidates", float, &[p, Dim::Fixed(CANDIDATE_FEATURES)], "candidate of each pair"),
+            value("pair_track", int64, &[Dim::Named("P")], "row of histories of each pair"),
+        ];
+        self.graph.output =
+            vec![value("probability", float, &[Dim::Named("P")], "that the candidate continues the track")];
+        self.graph
+    }
+
+    pub(super) fn floats(&mut self, name: &str, dims: &[usize], values: &[f32]) {
         assert_eq!(dims.iter().product::<usize>(), values.len(), "{name}: shape {dims:?}");
         let raw = values.iter().flat_map(|v| v.to_le_bytes()).collect();
         self.tensor(name, dims, data_type::FLOAT, raw);
     }
 
-    fn integers(&mut self, name: &str, values: &[i64]) {
+    pub(super) fn integers(&mut self, name: &str, values: &[i64]) {
         let raw = values.iter().flat_map(|v| v.to_le_bytes()).collect();
         self.tensor(name, &[values.len()], data_type::INT64, raw);
     }
@@ -47,7 +75,13 @@ impl Builder {
     }
 
     /// Adds a node named after its first non-empty output.
-    fn node(&mut self, op: &str, inputs: &[&str], outputs: &[&str], attribute: Vec<AttributeProto>) {
+    pub(super) fn node(
+        &mut self,
+        op: &str,
+        inputs: &[&str],
+        outputs: &[&str],
+        attribute: Vec<AttributeProto>,
+    ) {
         let owned = |names: &[&str]| names.iter().map(|n| (*n).to_owned()).collect();
         self.graph.node.push(NodeProto {
             input: owned(inputs),
@@ -59,7 +93,13 @@ impl Builder {
     }
 
     /// `output = clip((input - mean) * scale)`.
-    fn normalise(&mut self, input: &str, output: &str, prefix: [&str; 2], normaliser: &Normaliser) {
+    pub(super) fn normalise(
+        &mut self,
+        input: &str,
+        output: &str,
+        prefix: [&str; 2],
+        normaliser: &Normaliser,
+    ) {
         let width = normaliser.mean.len();
         let [mean, scale] = prefix;
         self.floats(mean, &[width], &normaliser.mean);
@@ -71,12 +111,12 @@ impl Builder {
     }
 }
 
-fn int(name: &str, value: i64) -> AttributeProto {
+pub(super) fn int(name: &str, value: i64) -> AttributeProto {
     let r#type = Some(attribute_type::INT);
     AttributeProto { name: Some(name.into()), i: Some(value), ints: vec![], r#type }
 }
 
-fn ints(name: &str, values: &[i64]) -> AttributeProto {
+pub(super) fn ints(name: &str, values: &[i64]) -> AttributeProto {
     let r#type = Some(attribute_type::INTS);
     AttributeProto { name: Some(name.into()), i: None, ints: values.to_vec(), r#type }
 }
@@ -115,7 +155,7 @@ fn ours(column: usize, hidden: usize) -> (usize, f32) {
 /// `[rows, 3 H]` of gates r, z, c to what ONNX's GRU wants: `[3 H, rows]`, gates z, r, c, and z
 /// negated, because ONNX's z keeps the old state where the paper's takes the new one and
 /// `1 - sigmoid(a) = sigmoid(-a)`.
-fn to_gru_op(weights: &[f32], rows: usize, hidden: usize) -> Vec<f32> {
+pub(super) fn to_gru_op(weights: &[f32], rows: usize, hidden: usize) -> Vec<f32> {
     let gates = 3 * hidden;
     (0..gates)
         .flat_map(|column| {
@@ -142,10 +182,7 @@ pub(super) fn from_gru_op(weights: &[f32], rows: usize, hidden: usize) -> Vec<f3
 pub(super) fn build(model: &LinkModel) -> GraphProto {
     let gru = &model.gru;
     let (shape, h, g) = (gru.shape, gru.shape.hidden, 3 * gru.shape.hidden);
-    let mut b = Builder::default();
-    b.graph.name = Some("gakp-link".into());
-    b.floats("clip.low", &[], &[-CLIP]);
-    b.floats("clip.high", &[], &[CLIP]);
+    let mut b = Builder::new("gakp-link");
 
     // Histories to states, [T, H].
     b.normalise("histories", "histories.z", [HISTORY_MEAN, HISTORY_SCALE], &model.history);
@@ -202,20 +239,5 @@ pub(super) fn build(model: &LinkModel) -> GraphProto {
     b.node("Squeeze", &["logit.1", "axis.1"], &["logit"], vec![]);
     b.node("Sigmoid", &["logit"], &["probability"], vec![]);
 
-    let (t, p) = (Dim::Named("T"), Dim::Named("P"));
-    let [float, int32, int64] = [data_type::FLOAT, data_type::INT32, data_type::INT64];
-    b.graph.input = vec![
-        value(
-            "histories",
-            float,
-            &[t, Dim::Fixed(HISTORY), Dim::Fixed(STEP_FEATURES)],
-            "observations of each track, oldest first, packed from index 0",
-        ),
-        value("lengths", int32, &[Dim::Named("T")], "valid observations of each track, 1 to 6"),
-        value("candidates", float, &[p, Dim::Fixed(CANDIDATE_FEATURES)], "candidate of each pair"),
-        value("pair_track", int64, &[Dim::Named("P")], "row of histories of each pair"),
-    ];
-    b.graph.output =
-        vec![value("probability", float, &[Dim::Named("P")], "that the candidate continues the track")];
-    b.graph
+    b.finish()
 }

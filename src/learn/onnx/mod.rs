@@ -13,6 +13,7 @@
 //! Features are raw: normalisation is part of the graph. Each track's history is encoded once and
 //! its contribution to the last step's gates is computed once, then gathered by pair.
 
+mod explicit;
 mod graph;
 pub mod proto;
 
@@ -20,10 +21,11 @@ use std::collections::BTreeMap;
 
 use prost::Message;
 
+use super::explicit::ExplicitModel;
 use super::gru::{Gru, GruShape};
 use super::model::{LinkModel, Normaliser};
 use crate::track::{CANDIDATE_FEATURES, STEP_FEATURES};
-use proto::{ModelProto, OperatorSetIdProto, StringStringEntryProto, TensorProto, data_type};
+use proto::{GraphProto, ModelProto, OperatorSetIdProto, StringStringEntryProto, TensorProto, data_type};
 
 /// ONNX intermediate representation and operator set that files are written for (ONNX 1.16).
 const IR_VERSION: i64 = 10;
@@ -48,8 +50,17 @@ pub enum OnnxError {
 /// The bytes of an ONNX file of `model`. `metadata` goes into the file's metadata properties, in
 /// the order of the keys; what describes the sizes is added.
 pub fn write(model: &LinkModel, doc: &str, metadata: &BTreeMap<String, String>) -> Vec<u8> {
+    file(graph::build(model), model.gru.shape.hidden, doc, metadata)
+}
+
+/// [`write()`] for a network of explicit features. The graph's inputs and output are the same.
+pub fn write_explicit(model: &ExplicitModel, doc: &str, metadata: &BTreeMap<String, String>) -> Vec<u8> {
+    file(explicit::build(model), model.shape.hidden, doc, metadata)
+}
+
+fn file(graph: GraphProto, hidden: usize, doc: &str, metadata: &BTreeMap<String, String>) -> Vec<u8> {
     let mut metadata = metadata.clone();
-    metadata.insert("hidden".into(), model.gru.shape.hidden.to_string());
+    metadata.insert("hidden".into(), hidden.to_string());
     let properties = metadata
         .into_iter()
         .map(|(key, value)| StringStringEntryProto { key: Some(key), value: Some(value) })
@@ -60,7 +71,7 @@ pub fn write(model: &LinkModel, doc: &str, metadata: &BTreeMap<String, String>) 
         producer_name: Some("gakp train".into()),
         producer_version: Some(env!("CARGO_PKG_VERSION").into()),
         doc_string: Some(doc.into()),
-        graph: Some(graph::build(model)),
+        graph: Some(graph),
         metadata_props: properties,
     }
     .encode_to_vec()

@@ -1,9 +1,9 @@
-//! From scored pairs to matches.
+//! From the worth of pairs to matches: the Hungarian assignment, knot by knot.
 //!
 //! Pairs that are allowed form a sparse bipartite graph; its connected components are solved one by
 //! one, so the cost of a crowd is the cost of its knots.
 
-use super::assign::assign;
+use crate::track::assign::assign;
 
 /// A match of a track with a detection.
 #[derive(Clone, Copy, Debug, PartialEq)]

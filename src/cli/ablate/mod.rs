@@ -1,0 +1,183 @@
+//! `gakp ablate`: the paper's table, every association in one run.
+
+mod table;
+mod variant;
+mod world;
+
+use std::collections::BTreeMap;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+
+use anyhow::{Context, Result, ensure};
+
+use super::models::ModelArgs;
+use crate::config::{Config, ModelConfig};
+use crate::infer::{Linker, ModelSettings};
+use crate::mot::{evaluate, replay};
+use crate::track::{Association, LinkRequest, TrackerConfig};
+use table::{Cell, Missing};
+use variant::Variant;
+use world::World;
+
+/// Tracks every sequence under ROOT with every association of the paper, everything else equal, and
+/// prints the paper's table: a block for each set of detections, one for all of them, and one for the
+/// sequences that have appearance vectors (det/det_features.npy).
+///
+/// A row that needs what is not there (a network, appearance) says so instead of a figure. Hz is frames
+/// a second of the tracker and the link network, one at a time, on this machine.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Args {
+    /// Folder of MOTChallenge sequences, each with gt/gt.txt, det/det.txt and seqinfo.ini.
+    root: PathBuf,
+    /// Folder of networks that leave one footage out, DIR/FOOTAGE.onnx, as `gakp train --loso` writes
+    /// them. Without, --link names one network for everything.
+    #[arg(long, value_name = "DIR")]
+    links: Option<PathBuf>,
+    /// The same for explicit features, as `gakp train --association explicit --loso` writes them.
+    #[arg(long, value_name = "DIR")]
+    explicit_links: Option<PathBuf>,
+    /// Only sequences whose names end in -SUFFIX; several, with commas between, in this order.
+    #[arg(long, value_name = "SUFFIX", value_delimiter = ',')]
+    det: Vec<String>,
+    /// Track and score only the second half of sequences whose names end in -SUFFIX (their detector was
+    /// trained on the first).
+    #[arg(long, value_name = "SUFFIX", value_delimiter = ',')]
+    second_half: Vec<String>,
+    /// Configuration file: its [models] and [tracker] hold for every row.
+    #[arg(long, short, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Print JSON: percentages at full precision.
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    models: ModelArgs,
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// A folder, file or setting that is wrong, or a network that cannot be loaded.
+pub fn run(args: Args) -> Result<()> {
+    let config = args.config.as_deref().map(Config::read).transpose()?.unwrap_or_default();
+    let models = ModelConfig::from(args.models.clone()).or(config.models);
+    let base = config.tracker.apply(TrackerConfig::default())?;
+    let worlds = world::load(&args.root, &args.det, &args.second_half)?;
+    let mut networks = Networks::new(&args, models, config.tracker.existence != Some(false))?;
+    let variants = variant::all(&base);
+    let results = worlds
+        .iter()
+        .map(|world| {
+            tracing::info!(sequence = world.name, "tracking");
+            variants.iter().map(|variant| measure(world, variant, &mut networks)).collect()
+        })
+        .collect::<Result<Vec<Vec<Cell>>>>()?;
+    networks.end();
+    let report = table::report(&worlds, &variants, &results);
+    let text = match args.json {
+        true => serde_json::to_string_pretty(&report)? + "\n",
+        false => table::print(&report),
+    };
+    std::io::stdout().write_all(text.as_bytes()).context("cannot write to standard output")
+}
+
+/// One row on one sequence.
+fn measure(world: &World, variant: &Variant, networks: &mut Networks) -> Result<Cell> {
+    if variant.appearance && world.embeddings.is_none() {
+        return Ok(Cell::Missing(Missing::Embeddings));
+    }
+    let method = variant.config.association.method;
+    let linker = match method.asks_scorer() {
+        true => match networks.get(method, &world.footage)? {
+            Some(linker) => Some(linker),
+            None => return Ok(Cell::Missing(Missing::Network)),
+        },
+        false => None,
+    };
+    // The same decision on what is output for every row, so that only the association differs.
+    let mut config = variant.config.clone();
+    if let Some(linker) = networks.get(Association::Implicit, &world.footage)?.filter(|_| networks.existence)
+    {
+        config = linker.calibrate(config);
+    }
+    let embeddings = |frame: usize| match &world.embeddings {
+        Some(embeddings) if variant.appearance => embeddings.frame(frame).to_vec(),
+        _ => Vec::new(),
+    };
+    let links = |request: &LinkRequest| match &linker {
+        Some(linker) => linker.score_blocking(request.clone()),
+        None => Ok(Vec::new()),
+    };
+    let start = Instant::now();
+    let rows = replay(&world.sequence, &config, embeddings, links)?;
+    let seconds = start.elapsed().as_secs_f64();
+    let frames = world.sequence.info.length;
+    let score = evaluate(&world.truth, &rows, frames, world.benchmark).with_context(|| world.name.clone())?;
+    Ok(Cell::Scored { score: Box::new(score), seconds, frames })
+}
+
+/// Link networks by association and footage, loaded when they are first asked for.
+struct Networks {
+    settings: ModelSettings,
+    /// Folder of one association's networks; one network for all footage otherwise.
+    folders: [(Association, Option<PathBuf>); 2],
+    single: bool,
+    /// Whether a network's existence head is used.
+    existence: bool,
+    loaded: BTreeMap<(&'static str, String), Option<Linker>>,
+}
+
+impl Networks {
+    fn new(args: &Args, models: ModelConfig, existence: bool) -> Result<Self> {
+        let single = models.link.is_some();
+        for folder in [&args.links, &args.explicit_links].into_iter().flatten() {
+            ensure!(folder.is_dir(), "there is no folder {}", folder.display());
+        }
+        let mut settings = models.settings()?;
+        settings.threads = Some(1);
+        let folders = [
+            (Association::Implicit, args.links.clone()),
+            (Association::Explicit, args.explicit_links.clone()),
+        ];
+        Ok(Self { settings, folders, single, existence, loaded: BTreeMap::new() })
+    }
+
+    /// The network for `footage`, one that has not seen it; `None` when there is none.
+    fn get(&mut self, association: Association, footage: &str) -> Result<Option<Linker>> {
+        let folder = self.folders.iter().find(|(of, _)| *of == association).and_then(|(_, f)| f.as_deref());
+        let name = match folder {
+            Some(_) => footage.to_string(),
+            None => String::new(),
+        };
+        let key = (association.as_str(), name);
+        if !self.loaded.contains_key(&key) {
+            let linker = self.load(association, folder, footage)?;
+            self.loaded.insert(key.clone(), linker);
+        }
+        Ok(self.loaded.get(&key).cloned().flatten())
+    }
+
+    fn load(&self, association: Association, folder: Option<&Path>, footage: &str) -> Result<Option<Linker>> {
+        let mut settings = self.settings.clone();
+        match folder {
+            Some(folder) => {
+                let file = folder.join(format!("{footage}.onnx"));
+                if !file.is_file() {
+                    return Ok(None);
+                }
+                settings.link = file.display().to_string();
+            }
+            // The shipped network may have been trained on this very footage.
+            None if !self.single || association != Association::Implicit => return Ok(None),
+            None => {}
+        }
+        let linker = Linker::load(&settings, Arc::new(()))?;
+        linker.check_suits(association)?;
+        Ok(Some(linker))
+    }
+
+    fn end(self) {
+        self.loaded.values().flatten().for_each(Linker::shutdown);
+    }
+}

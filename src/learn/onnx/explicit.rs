@@ -1,0 +1,72 @@
+//! The graph of explicit features: weights of every track, weighted costs of every pair.
+
+use super::super::explicit::ExplicitModel;
+use super::graph::{Builder, GRU_W, int, ints, to_gru_op};
+use super::proto::GraphProto;
+use crate::track::association::explicit::{COST_LIMITS, COSTS, LEAST_DT};
+use crate::track::{STEP_FEATURES, features};
+
+/// The graph of `model`; inputs and output are those of the implicit network.
+pub(super) fn build(model: &ExplicitModel) -> GraphProto {
+    let shape = model.shape;
+    let (h, g) = (shape.hidden, 3 * shape.hidden);
+    let part = |range: std::ops::Range<usize>| &model.theta[range];
+    let mut b = Builder::new("gakp-explicit");
+
+    // Histories to weights, [T, COSTS].
+    b.normalise("histories", "histories.z", ["history.mean", "history.scale"], &model.history);
+    b.node("Transpose", &["histories.z"], &["steps"], vec![ints("perm", &[1, 0, 2])]);
+    b.floats(GRU_W, &[1, g, STEP_FEATURES], &to_gru_op(part(shape.w()), STEP_FEATURES, h));
+    b.floats("gru.R", &[1, g, h], &to_gru_op(part(shape.u()), h, h));
+    let mut bias = to_gru_op(part(shape.b()), 1, h);
+    bias.resize(2 * g, 0.0);
+    b.floats("gru.B", &[1, 2 * g], &bias);
+    let attributes = vec![int("hidden_size", h as i64), int("linear_before_reset", 0)];
+    b.node("GRU", &["steps", GRU_W, "gru.R", "gru.B", "lengths"], &["", "state.1"], attributes);
+    b.integers("axis.0", &[0]);
+    b.node("Squeeze", &["state.1", "axis.0"], &["state"], vec![]);
+    b.floats("weights.V", &[h, COSTS], part(shape.v()));
+    b.floats("weights.v", &[COSTS], part(shape.v0()));
+    b.node("Gemm", &["state", "weights.V", "weights.v"], &["weights.raw"], vec![]);
+    b.node("Softplus", &["weights.raw"], &["weights"], vec![]);
+    b.node("Gather", &["weights", "pair_track"], &["pair.weights"], vec![int("axis", 0)]);
+
+    // Candidates to squared features, [P, COSTS].
+    let column = |b: &mut Builder, name: &str, columns: &[i64]| {
+        let index = format!("{name}.columns");
+        b.integers(&index, columns);
+        b.node("Gather", &["candidates", &index], &[name], vec![int("axis", 1)]);
+    };
+    column(&mut b, "mahalanobis", &[features::MAHALANOBIS as i64]);
+    column(&mut b, "iou", &[features::IOU as i64]);
+    let first = features::INNOVATION as i64;
+    column(&mut b, "innovation", &[first, first + 1]);
+    column(&mut b, "dt", &[features::DT as i64]);
+    b.floats("unit", &[1], &[features::MAHALANOBIS_UNIT as f32]);
+    b.floats("one", &[1], &[1.0]);
+    b.floats("dt.least", &[1], &[LEAST_DT]);
+    b.integers("axis.1", &[1]);
+    b.node("Mul", &["mahalanobis", "unit"], &["distance"], vec![]);
+    b.node("Mul", &["distance", "distance"], &["distance2"], vec![]);
+    b.node("Sub", &["one", "iou"], &["apart"], vec![]);
+    b.node("Mul", &["apart", "apart"], &["apart2"], vec![]);
+    b.node("Mul", &["innovation", "innovation"], &["innovation2"], vec![]);
+    b.node("ReduceSum", &["innovation2", "axis.1"], &["moved2"], vec![int("keepdims", 1)]);
+    b.node("Max", &["dt", "dt.least"], &["dt.safe"], vec![]);
+    b.node("Mul", &["dt.safe", "dt.safe"], &["dt2"], vec![]);
+    b.node("Div", &["moved2", "dt2"], &["velocity2"], vec![]);
+    b.node("Div", &["velocity2", "dt2"], &["acceleration2"], vec![]);
+    let parts = ["distance2", "apart2", "velocity2", "acceleration2"];
+    b.node("Concat", &parts, &["costs.raw"], vec![int("axis", 1)]);
+    b.floats("costs.limits", &[COSTS], &COST_LIMITS);
+    b.floats("costs.scale", &[COSTS], &model.scale);
+    b.node("Min", &["costs.raw", "costs.limits"], &["costs.cut"], vec![]);
+    b.node("Mul", &["costs.cut", "costs.scale"], &["costs"], vec![]);
+
+    b.node("Mul", &["costs", "pair.weights"], &["costs.weighted"], vec![]);
+    b.node("ReduceSum", &["costs.weighted", "axis.1"], &["cost"], vec![int("keepdims", 0)]);
+    b.floats("bias", &[1], &[model.theta[shape.bias()]]);
+    b.node("Sub", &["bias", "cost"], &["logit"], vec![]);
+    b.node("Sigmoid", &["logit"], &["probability"], vec![]);
+    b.finish()
+}
