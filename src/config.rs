@@ -12,6 +12,7 @@ use crate::api::NewCamera;
 use crate::detect::DetectorSettings;
 use crate::infer::ModelSettings;
 use crate::track::{Association, PairScore, TrackerConfig};
+use crate::tuning::Tuning;
 
 /// The whole file.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize)]
@@ -62,6 +63,8 @@ pub struct ModelConfig {
 #[derive(Clone, Debug, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrackerOptions {
+    /// A tuning file of `gakp tune`: the filter's noise. Relative to the configuration's folder.
+    pub tuning: Option<PathBuf>,
     /// Detections from this score on take part in the first matching stage.
     pub high_score: Option<f64>,
     /// Detections below this score are ignored.
@@ -108,7 +111,8 @@ impl Config {
     pub fn read(path: &Path) -> Result<Self> {
         let text = std::fs::read_to_string(path)
             .with_context(|| format!("cannot read the configuration {}", path.display()))?;
-        Self::parse(&text).with_context(|| format!("in the configuration {}", path.display()))
+        let folder = path.parent().unwrap_or(Path::new(""));
+        Self::parse_in(&text, folder).with_context(|| format!("in the configuration {}", path.display()))
     }
 
     /// Reads a text.
@@ -116,12 +120,18 @@ impl Config {
     /// # Errors
     /// As [`Config::read`].
     pub fn parse(text: &str) -> Result<Self> {
-        let config: Config = toml::from_str(text).map_err(|error| {
+        Self::parse_in(text, Path::new(""))
+    }
+
+    /// Files that `text` names are looked for in `folder`.
+    fn parse_in(text: &str, folder: &Path) -> Result<Self> {
+        let mut config: Config = toml::from_str(text).map_err(|error| {
             // The snippet that TOML's error quotes may hold a camera's password.
             let line =
                 error.span().map_or(0, |span| text[..span.start.min(text.len())].matches('\n').count() + 1);
             anyhow::anyhow!("line {line}: {}", error.message())
         })?;
+        config.tracker.tuning = config.tracker.tuning.map(|file| folder.join(file));
         config.tracker.apply(TrackerConfig::default())?;
         let mut names: Vec<_> = config.cameras.iter().map(|c| c.id.as_str()).collect();
         names.sort_unstable();
@@ -199,11 +209,26 @@ impl TrackerOptions {
         Ok(ModelSettings { link, ..models.clone() })
     }
 
+    /// These options with the tuning file of the command line, where one is given.
+    ///
+    /// # Errors
+    /// The file cannot be used; the message names it.
+    pub fn tuned(mut self, file: Option<PathBuf>) -> Result<Self> {
+        if let Some(file) = file {
+            Tuning::read(&file)?;
+            self.tuning = Some(file);
+        }
+        Ok(self)
+    }
+
     /// `base` with what these options change.
     ///
     /// # Errors
-    /// A value out of its range; the message names the key.
+    /// A value out of its range, or a tuning file that cannot be used; the message names the key or the file.
     pub fn apply(&self, mut base: TrackerConfig) -> Result<TrackerConfig> {
+        if let Some(file) = &self.tuning {
+            base.filter = Tuning::read(file).context("tracker.tuning")?.filter.apply(base.filter);
+        }
         let unit = |key: &str, value: Option<f64>, into: &mut f64| -> Result<()> {
             if let Some(value) = value {
                 ensure!((0.0..=1.0).contains(&value), "tracker.{key} = {value}: must be from 0 to 1");
@@ -338,6 +363,25 @@ mod tests {
             let message = format!("{:#}", Config::parse(text).unwrap_err());
             assert!(message.contains(expected), "{text:?} gave {message:?}");
         }
+    }
+
+    #[test]
+    fn a_tuning_is_found_beside_the_configuration() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("gakp.toml");
+        std::fs::write(&file, "[tracker]\ntuning = \"tuned.toml\"\nlambda_c = 0.7\n").unwrap();
+        let missing = format!("{:#}", Config::read(&file).unwrap_err());
+        assert!(missing.contains("tracker.tuning") && missing.contains("tuned.toml"), "{missing}");
+
+        let tuned = folder.path().join("tuned.toml");
+        std::fs::write(&tuned, "[filter]\ncentre_walk = 0.25\n").unwrap();
+        let config = Config::read(&file).unwrap();
+        let filter = config.tracker.apply(TrackerConfig::default()).unwrap().filter;
+        assert_eq!((filter.centre_walk, filter.adaptation.lambda), (0.25, 0.7));
+
+        std::fs::write(&tuned, "[filter]\ncentre_walks = 0.25\n").unwrap();
+        let wrong = format!("{:#}", Config::read(&file).unwrap_err());
+        assert!(wrong.contains("tuned.toml") && wrong.contains("centre_walks"), "{wrong}");
     }
 
     #[test]

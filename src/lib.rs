@@ -31,6 +31,8 @@ pub mod config;
 pub mod pipeline;
 #[cfg(feature = "service")]
 pub mod telemetry;
+#[cfg(any(feature = "service", feature = "cli"))]
+pub mod tuning;
 
 #[cfg(feature = "service")]
 pub mod api;

@@ -47,6 +47,9 @@ pub struct Args {
     /// Most cameras at a time [default: 64].
     #[arg(long, value_name = "N")]
     max_cameras: Option<usize>,
+    /// Tuning file of `gakp tune`: the noise of the Kalman filter.
+    #[arg(long, value_name = "FILE")]
+    tuning: Option<PathBuf>,
     #[command(flatten)]
     models: ModelArgs,
 }
@@ -85,6 +88,7 @@ struct Plan {
 impl Plan {
     fn new(args: Args) -> Result<Self> {
         let config = args.config.as_deref().map(Config::read).transpose()?.unwrap_or_default();
+        let tracker = config.tracker.tuned(args.tuning)?;
         let mut cameras = config.cameras;
         for text in &args.cameras {
             let camera = camera(text, args.looped)?;
@@ -113,7 +117,7 @@ impl Plan {
             cameras,
             store: Store::open(&state_dir)?,
             limit,
-            tracker: config.tracker,
+            tracker,
             models: crate::config::ModelConfig::from(args.models).or(config.models).settings()?,
         })
     }

@@ -44,6 +44,9 @@ pub struct Args {
     /// Configuration file: its [models] and [tracker] hold here too.
     #[arg(long, short, value_name = "FILE")]
     config: Option<PathBuf>,
+    /// Tuning file of `gakp tune`: the noise of the Kalman filter.
+    #[arg(long, value_name = "FILE")]
+    tuning: Option<PathBuf>,
     #[command(flatten)]
     models: ModelArgs,
 }
@@ -65,7 +68,7 @@ pub(super) struct Job {
 pub fn run(args: Args) -> Result<()> {
     let config = args.config.as_deref().map(Config::read).transpose()?.unwrap_or_default();
     let job = Job {
-        tracker: config.tracker,
+        tracker: config.tracker.tuned(args.tuning)?,
         models: ModelConfig::from(args.models).or(config.models).settings()?,
         frames: args.frames,
         second_half: args.second_half,
