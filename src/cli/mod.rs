@@ -17,6 +17,8 @@ mod signals;
 pub mod track;
 #[cfg(feature = "learn")]
 pub mod train;
+#[cfg(feature = "learn")]
+pub mod tune;
 
 use std::io::{self, IsTerminal};
 
@@ -58,6 +60,9 @@ pub enum Command {
     /// Train the link scorer on MOTChallenge sequences.
     #[cfg(feature = "learn")]
     Train(train::Args),
+    /// Tune the noise of the Kalman filter on MOTChallenge sequences.
+    #[cfg(feature = "learn")]
+    Tune(tune::Args),
 }
 
 /// Runs what the command line says.
@@ -80,6 +85,8 @@ pub fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Bench(args) => bench::run(args),
         #[cfg(feature = "learn")]
         Command::Train(args) => train::run(args),
+        #[cfg(feature = "learn")]
+        Command::Tune(args) => tune::run(args),
     }
 }
 

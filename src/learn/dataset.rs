@@ -234,7 +234,7 @@ pub fn vary(sequence: &LabelledSequence, variant: &Variant, rng: &mut fastrand::
 }
 
 /// A standard normal number (Box and Muller).
-fn normal(rng: &mut fastrand::Rng) -> f64 {
+pub(super) fn normal(rng: &mut fastrand::Rng) -> f64 {
     let radius = (-2.0 * (1.0 - rng.f64()).ln()).sqrt();
     radius * (std::f64::consts::TAU * rng.f64()).cos()
 }

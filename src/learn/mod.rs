@@ -25,6 +25,7 @@ pub mod onnx;
 mod recipe;
 mod scorer;
 mod teacher;
+pub mod tune;
 
 pub use adam::{Adam, Schedule};
 pub use examples::Examples;
