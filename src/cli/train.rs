@@ -16,7 +16,8 @@ use crate::learn::dataset::{self, LabelledSequence};
 use crate::learn::network::{Network, Scorer};
 use crate::learn::{Boxes, Examples, Fit, HeadFit, Recipe, Teacher, fit_head, metrics};
 use crate::mot::{Benchmark, Row, Sequence, SequenceInfo, evaluate, first_half_length, parse_truth, replay};
-use crate::track::{Association, ExistenceHead, TrackerConfig};
+use crate::track::{Association, ExistenceHead, FilterConfig, TrackerConfig};
+use crate::tuning::Tuning;
 
 /// Trains the network that says how probable it is that a detection continues a track.
 ///
@@ -45,6 +46,10 @@ pub struct Args {
     /// explicit features.
     #[arg(long, value_name = "NAME", default_value = "implicit", value_parser = ["implicit", "explicit"])]
     pub association: String,
+    /// Tuning file of `gakp tune`: the filter that the network will be used with. With --loso a folder
+    /// that has FOOTAGE.toml of each.
+    #[arg(long, value_name = "FILE")]
+    pub tuning: Option<PathBuf>,
     /// Seed of everything random.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
@@ -156,7 +161,9 @@ fn train(
     let (held, seen): (Vec<&Source>, Vec<&Source>) = sources.iter().partition(|s| held_out(&s.labelled));
     ensure!(!seen.is_empty(), "nothing to train on: every sequence is held out");
     let name = out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    let recipe = Recipe { examples: args.examples as usize, seed: args.seed, ..Recipe::default() };
+    let tracker = TrackerConfig { filter: filter(args, out)?, ..TrackerConfig::default() };
+    let teacher = Teacher { filter: tracker.filter, ..Teacher::default() };
+    let recipe = Recipe { teacher, examples: args.examples as usize, seed: args.seed, ..Recipe::default() };
     let examples = collect(&recipe, &seen, &name);
     ensure!(
         !examples.is_empty(),
@@ -170,14 +177,14 @@ fn train(
         ..Fit::default()
     };
     let model = run_fit(args.association.parse()?, &settings, &examples, &name);
-    let boxes = boxes(&model, &seen, &args.second_half, &name)?;
+    let boxes = boxes(&model, &tracker, &seen, &args.second_half, &name)?;
     ensure!(!boxes.is_empty(), "the tracker confirms no track in the training sequences");
     let head_fit = HeadFit { seed: args.seed, ..HeadFit::default() };
     let head = Arc::new(fit_head(&boxes, &head_fit));
 
     let mut scores = vec![];
     for source in &held {
-        let found = score(&model, &head, source, &args.second_half)?;
+        let found = score(&model, &tracker, &head, source, &args.second_half)?;
         println!(
             "{name} {}: {} pairs, AUC {:.4}, cross-entropy {:.4}, calibration error {:.4}; HOTA {:.2} MOTA {:.2} IDF1 {:.2} IDs {}",
             found.sequence,
@@ -222,6 +229,17 @@ fn train(
     write(&out.with_extension("toml"), manifest(out, &bytes, &args.licence, model.family())?.as_bytes())?;
     println!("wrote {} ({} examples)", out.display(), examples.len());
     Ok(scores)
+}
+
+/// The filter that the network in `out` is for.
+fn filter(args: &Args, out: &Path) -> Result<FilterConfig> {
+    let default = FilterConfig::default();
+    let Some(file) = &args.tuning else { return Ok(default) };
+    let file = match &args.loso {
+        Some(_) => file.join(out.with_extension("toml").file_name().unwrap_or_default()),
+        None => file.clone(),
+    };
+    Ok(Tuning::read(&file)?.filter.apply(default))
 }
 
 /// A manifest of this one network, so that `--link OUT.onnx` takes it.
@@ -295,11 +313,17 @@ fn counted(source: &Source, second_half: &[String]) -> Result<(bool, LabelledSeq
 }
 
 /// What the tracker puts out on the sequences that the network was trained on.
-fn boxes(model: &Network, seen: &[&Source], second_half: &[String], name: &str) -> Result<Boxes> {
+fn boxes(
+    model: &Network,
+    tracker: &TrackerConfig,
+    seen: &[&Source],
+    second_half: &[String],
+    name: &str,
+) -> Result<Boxes> {
     let bar = bar(seen.len() as u64, "{msg} {wide_bar} {pos}/{len}");
     bar.set_message(format!("{name}: boxes"));
     let mut scorer = Scorer::new(model.clone());
-    let mut config = TrackerConfig::default();
+    let mut config = tracker.clone();
     config.association.method = model.association();
     let mut boxes = Boxes::default();
     for source in seen {
@@ -318,6 +342,7 @@ fn boxes(model: &Network, seen: &[&Source], second_half: &[String], name: &str) 
 /// Pairs and tracks of a sequence under a network and a head that have not seen it.
 fn score(
     model: &Network,
+    tracker: &TrackerConfig,
     head: &Arc<ExistenceHead>,
     source: &Source,
     second_half: &[String],
@@ -325,7 +350,8 @@ fn score(
     let (half, counted, truth) = counted(source, second_half)?;
     let length = counted.frames.len() as u32;
     let mut pairs = Examples::default();
-    Teacher::natural().collect(&counted, &mut fastrand::Rng::with_seed(0), &mut pairs);
+    let teacher = Teacher { filter: tracker.filter, ..Teacher::natural() };
+    teacher.collect(&counted, &mut fastrand::Rng::with_seed(0), &mut pairs);
     let link = metrics::scores(&model.logits(&pairs), pairs.labels(), pairs.weights());
 
     let sequence = Sequence {
@@ -344,7 +370,7 @@ fn score(
         scorer.score(request, &mut links);
         Ok::<_, Infallible>(links)
     };
-    let mut config = TrackerConfig::default();
+    let mut config = tracker.clone();
     config.association.method = model.association();
     config.existence.head = Some(head.clone());
     let rows = replay(&sequence, &config, |_| vec![], links)?;

@@ -9,7 +9,9 @@ use std::collections::BTreeMap;
 
 use super::dataset::{LabelledSequence, Owner};
 use super::examples::Examples;
-use crate::track::{Decision, FrameInput, GateConfig, LinkRequest, Match, Tracker, TrackerConfig};
+use crate::track::{
+    Decision, FilterConfig, FrameInput, GateConfig, LinkRequest, Match, Tracker, TrackerConfig,
+};
 use crate::types::TrackId;
 
 /// How pairs are made and chosen.
@@ -35,6 +37,8 @@ pub struct Teacher {
     pub or_distance: f64,
     /// Whether false alarms make tracks too: pairs of those with people are negatives.
     pub false_tracks: bool,
+    /// The filter that predicts: the one that the network will be used with.
+    pub filter: FilterConfig,
 }
 
 impl Default for Teacher {
@@ -50,6 +54,7 @@ impl Default for Teacher {
             or_iou: 0.1,
             or_distance: 0.5,
             false_tracks: false,
+            filter: FilterConfig::default(),
         }
     }
 }
@@ -137,7 +142,7 @@ impl Teacher {
     }
 
     fn tracker_config(&self) -> TrackerConfig {
-        let mut config = TrackerConfig::default();
+        let mut config = TrackerConfig { filter: self.filter, ..TrackerConfig::default() };
         config.gate.mahalanobis = self.mahalanobis;
         config.gate.or_iou = Some(self.or_iou);
         config.gate.or_distance = Some(self.or_distance);
