@@ -177,7 +177,9 @@ impl LinkModel {
         let outlet = session.outputs().iter().find(|outlet| outlet.name() == OUTPUT);
         let outlet = outlet.ok_or_else(|| wrong(format!("it has no output {OUTPUT:?}")))?;
         check_type("output", outlet, TensorElementType::Float32).map_err(wrong)?;
-        let existence = session.metadata().ok().and_then(|metadata| metadata.custom(EXISTENCE));
+        let metadata = session.metadata().map_err(|e| wrong(format!("its metadata cannot be read: {e}")))?;
+        let existence = metadata.custom(EXISTENCE);
+        drop(metadata);
         let existence = existence.map(|text| text.parse()).transpose();
         let existence =
             existence.map_err(|e| wrong(format!("its existence head is broken: {e}")))?.map(Arc::new);
