@@ -11,6 +11,7 @@ mod activate;
 mod adam;
 pub mod card;
 pub mod dataset;
+mod descent;
 mod examples;
 mod existence;
 pub mod explicit;
