@@ -1,7 +1,6 @@
-//! The real binary as a child process, real RTSP cameras, and small blocking clients.
+//! The real binary as a child process, real RTSP cameras.
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
-use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::ops::ControlFlow;
@@ -14,8 +13,11 @@ use gakp::ingest::{Pacing, Pixels, SourceEvent, SourceSpec, VideoWriter};
 use gakp::types::{CameraId, YuvMatrix, YuvRange};
 use serde_json::Value;
 use socket2::{Domain, Socket as RawSocket, Type};
-use tokio_tungstenite::tungstenite::client::IntoClientRequest;
-use tokio_tungstenite::tungstenite::{self, Message, WebSocket};
+
+#[path = "client.rs"]
+mod client;
+
+pub use client::{Metrics, Socket};
 
 /// Long enough for any step on a busy machine; reaching it is a failure.
 pub const PATIENCE: Duration = Duration::from_secs(60);
@@ -370,95 +372,6 @@ impl Response {
     #[track_caller]
     pub fn json(&self) -> Value {
         serde_json::from_str(&self.body).unwrap_or_else(|e| panic!("{e}: {self:?}"))
-    }
-}
-
-/// `/metrics`, by the series' full name.
-#[derive(Debug)]
-pub struct Metrics(BTreeMap<String, f64>);
-
-impl Metrics {
-    fn parse(text: &str) -> Self {
-        let lines = text.lines().filter(|line| !line.starts_with('#'));
-        Self(
-            lines.map(|l| l.rsplit_once(' ').unwrap()).map(|(k, v)| (k.into(), v.parse().unwrap())).collect(),
-        )
-    }
-
-    /// The value of a series such as `gakp_camera_up{camera="gate"}`.
-    #[track_caller]
-    pub fn get(&self, series: &str) -> f64 {
-        *self.0.get(series).unwrap_or_else(|| panic!("no series {series} in {:?}", self.0.keys()))
-    }
-
-    pub fn of(&self, name: &str, camera: &str) -> f64 {
-        self.get(&format!("{name}{{camera=\"{camera}\"}}"))
-    }
-
-    pub fn dropped(&self, camera: &str, reason: &str) -> f64 {
-        self.get(&format!("gakp_frames_dropped_total{{camera=\"{camera}\",reason=\"{reason}\"}}"))
-    }
-
-    /// A camera's account: frames in, tracked, dropped for any reason.
-    pub fn account(&self, camera: &str) -> [u64; 3] {
-        let prefix = format!("gakp_frames_dropped_total{{camera=\"{camera}\",");
-        let dropped = self.0.iter().filter(|(series, _)| series.starts_with(&prefix)).map(|(_, v)| v).sum();
-        let counts = [self.of("gakp_frames_in_total", camera), self.of("gakp_frames_tracked_total", camera)];
-        [counts[0], counts[1], dropped].map(|count: f64| count as u64)
-    }
-}
-
-/// A WebSocket client.
-pub struct Socket {
-    socket: WebSocket<TcpStream>,
-}
-
-impl Socket {
-    fn open(stream: TcpStream, address: SocketAddr, path: &str, protocol: Option<&str>) -> Self {
-        let mut request = format!("ws://{address}{path}").into_client_request().unwrap();
-        if let Some(protocol) = protocol {
-            request.headers_mut().insert("sec-websocket-protocol", protocol.parse().unwrap());
-        }
-        let (socket, _) = tungstenite::client(request, stream).expect("the handshake");
-        Self { socket }
-    }
-
-    /// The next message that is no ping; an error when the connection is gone.
-    pub fn message(&mut self) -> tungstenite::Result<Message> {
-        loop {
-            match self.socket.read()? {
-                Message::Ping(_) | Message::Pong(_) => {}
-                message => return Ok(message),
-            }
-        }
-    }
-
-    #[track_caller]
-    pub fn json(&mut self) -> Value {
-        match self.message() {
-            Ok(Message::Text(text)) => serde_json::from_str(&text).unwrap(),
-            other => panic!("not a text message: {other:?}"),
-        }
-    }
-
-    #[track_caller]
-    pub fn binary(&mut self) -> Vec<u8> {
-        match self.message() {
-            Ok(Message::Binary(bytes)) => bytes.into(),
-            other => panic!("not a binary message: {other:?}"),
-        }
-    }
-
-    /// Reads until the server closes; its close code.
-    #[track_caller]
-    pub fn closed(&mut self) -> u16 {
-        loop {
-            match self.message() {
-                Ok(Message::Close(frame)) => return frame.expect("a close code").code.into(),
-                Ok(_) => {}
-                Err(error) => panic!("no goodbye: {error}"),
-            }
-        }
     }
 }
 
