@@ -9,8 +9,9 @@ use super::activate::sigmoid;
 use super::adam::{Adam, Schedule};
 use super::dataset::LabelledSequence;
 use crate::mot::Row;
+use crate::track::existence::Scene;
 use crate::track::{
-    Dense, EXISTENCE_FEATURES, ExistenceHead, FrameInput, LinkRequest, Tracker, TrackerConfig, existence,
+    Dense, EXISTENCE_FEATURES, ExistenceHead, FrameInput, LinkRequest, Tracker, TrackerConfig,
 };
 use crate::types::BBox;
 
@@ -77,14 +78,10 @@ impl Boxes {
             if tracker.update(&links).is_err() {
                 continue;
             }
-            let values = existence::features(tracker.tracks(), width, height);
-            let (shown, values): (Vec<(BBox, bool)>, Vec<_>) = tracker
-                .tracks()
-                .iter()
-                .zip(values)
-                .filter(|(track, _)| track.confirmed)
-                .map(|(track, values)| ((track.bbox(), track.matched), values))
-                .unzip();
+            let scene = Scene::new(tracker.tracks(), (width, height));
+            let believed = tracker.tracks().iter().enumerate().filter(|(_, track)| track.confirmed);
+            let (shown, values): (Vec<(BBox, bool)>, Vec<_>) =
+                believed.map(|(index, track)| ((track.bbox(), track.matched), scene.features(index))).unzip();
             for ((right, values), (bbox, _)) in labels(&shown, people).into_iter().zip(values).zip(&shown) {
                 if right || neutral.iter().all(|n| n.iou(bbox) < MATCH_IOU) {
                     self.features.push(values);

@@ -33,8 +33,9 @@ pub const EXISTENCE_FEATURES: usize = 13;
 /// Normalised values are clipped at this many standard deviations.
 const CLIP: f32 = 4.0;
 
-/// Bounds on a network that is read: a wrong file must not ask for memory without end.
-const MAX_WIDTH: usize = 1024;
+/// Widest layer: what a box passes through stays on the stack.
+const MAX_WIDTH: usize = 64;
+/// A wrong file must not ask for memory without end.
 const MAX_LAYERS: usize = 8;
 
 /// One fully connected layer.
@@ -91,6 +92,9 @@ impl ExistenceHead {
             if bias.is_empty() || weights.len() != width * bias.len() {
                 return wrong("its weights do not fit the layer before it and its own bias");
             }
+            if bias.len() > MAX_WIDTH {
+                return wrong("it is wider than 64");
+            }
             if !weights.iter().chain(bias).all(|v| v.is_finite()) {
                 return wrong("it holds a number that is not finite");
             }
@@ -127,18 +131,18 @@ impl ExistenceHead {
 
     /// Log-odds that the box shows its object.
     pub fn logit(&self, features: &[f32; EXISTENCE_FEATURES]) -> f32 {
-        let mut values = self.normalise(features).to_vec();
-        let mut next = Vec::new();
+        let (mut values, mut next) = ([0.0; MAX_WIDTH], [0.0; MAX_WIDTH]);
+        values[..EXISTENCE_FEATURES].copy_from_slice(&self.normalise(features));
         for (depth, Dense { weights, bias }) in self.layers.iter().enumerate() {
-            next.clear();
-            next.extend_from_slice(bias);
+            let next = &mut next[..bias.len()];
+            next.copy_from_slice(bias);
             for (value, row) in values.iter().zip(weights.chunks_exact(bias.len())) {
                 next.iter_mut().zip(row).for_each(|(sum, weight)| *sum += value * weight);
             }
             if depth + 1 < self.layers.len() {
                 next.iter_mut().for_each(|value| *value = value.tanh());
             }
-            std::mem::swap(&mut values, &mut next);
+            values[..bias.len()].copy_from_slice(next);
         }
         values[0]
     }
@@ -199,15 +203,27 @@ impl FromStr for ExistenceHead {
     }
 }
 
-/// The values of every track, in the order of `tracks`, in a `width` x `height` picture. A frame's
-/// matches must have been applied.
-pub fn features(tracks: &[Tracklet], width: f64, height: f64) -> Vec<[f32; EXISTENCE_FEATURES]> {
-    let boxes: Vec<BBox> = tracks.iter().map(Tracklet::bbox).collect();
-    let solid: Vec<usize> = (0..tracks.len()).filter(|&i| tracks[i].matched && tracks[i].confirmed).collect();
-    let of = |index: usize| {
-        let (track, b) = (&tracks[index], &boxes[index]);
+/// The tracks of a frame whose matches have been applied, seen together.
+pub struct Scene<'a> {
+    tracks: &'a [Tracklet],
+    boxes: Vec<BBox>,
+    /// Tracks that may cover others: matched and believed.
+    solid: Vec<usize>,
+    size: (f64, f64),
+}
+
+impl<'a> Scene<'a> {
+    /// `tracks` in a picture of `size` (width, height).
+    pub fn new(tracks: &'a [Tracklet], size: (f64, f64)) -> Self {
+        let solid = (0..tracks.len()).filter(|&i| tracks[i].matched && tracks[i].confirmed).collect();
+        Self { tracks, boxes: tracks.iter().map(Tracklet::bbox).collect(), solid, size }
+    }
+
+    /// The values of a track, by its index.
+    pub fn features(&self, index: usize) -> [f32; EXISTENCE_FEATURES] {
+        let (track, b) = (&self.tracks[index], &self.boxes[index]);
         let (mut overlap, mut covered) = (0.0f64, 0.0f64);
-        for other in solid.iter().filter(|other| **other != index).map(|other| &boxes[*other]) {
+        for other in self.solid.iter().filter(|other| **other != index).map(|other| &self.boxes[*other]) {
             let common = b.intersection(other);
             if common > 0.0 {
                 overlap = overlap.max(common / (b.area() + other.area() - common));
@@ -217,8 +233,9 @@ pub fn features(tracks: &[Tracklet], width: f64, height: f64) -> Vec<[f32; EXIST
             }
         }
         let hits = f64::from(track.hits);
+        let (width, height) = self.size;
         let border = b.x.min(b.y).min(width - b.right()).min(height - b.bottom()) / b.w;
-        let streak = if track.matched { track.time.since(track.matched_since) } else { 0.0 };
+        let streak = track.matched_since.map_or(0.0, |since| track.time.since(since));
         [
             track.missed_for(),
             hits.min(100.0),
@@ -235,8 +252,7 @@ pub fn features(tracks: &[Tracklet], width: f64, height: f64) -> Vec<[f32; EXIST
             track.time.since(track.born).ln_1p(),
         ]
         .map(|v| v as f32)
-    };
-    (0..tracks.len()).map(of).collect()
+    }
 }
 
 #[cfg(test)]
@@ -270,6 +286,7 @@ mod tests {
             (vec![], "one output"),
             (vec![first(2)], "one output"),
             (vec![first(2), Dense { weights: vec![0.0], bias: vec![0.0] }], "do not fit"),
+            (vec![first(65)], "wider than 64"),
             (vec![Dense { weights: vec![f32::NAN; EXISTENCE_FEATURES], bias: vec![0.0] }], "not finite"),
         ] {
             let error = new(layers).unwrap_err().to_string();

@@ -232,14 +232,13 @@ impl Tracker {
             return self.tracks.iter().map(|t| t.matched || t.missed_for() <= coast).collect();
         };
         let ExistenceConfig { matched, coasted, coast, .. } = self.config.existence;
-        let (width, height) = self.size;
-        let values = existence::features(&self.tracks, width, height);
-        let shown = |(track, values): (&Tracklet, &_)| {
-            track.confirmed
-                && (track.matched || track.missed_for() <= coast)
-                && f64::from(head.logit(values)) >= if track.matched { matched } else { coasted }
+        let scene = existence::Scene::new(&self.tracks, self.size);
+        let shown = |(index, track): (usize, &Tracklet)| {
+            let least = if track.matched { matched } else { coasted };
+            let may = track.confirmed && (track.matched || track.missed_for() <= coast);
+            may && f64::from(head.logit(&scene.features(index))) >= least
         };
-        self.tracks.iter().zip(&values).map(shown).collect()
+        self.tracks.iter().enumerate().map(shown).collect()
     }
 
     fn take_detections(&mut self, frame: &FrameInput<'_>) {

@@ -54,10 +54,8 @@ pub struct Tracklet {
     pub frames: u32,
     /// Matches so far, birth included.
     pub hits: u32,
-    /// Frames since the last match.
-    pub missed_frames: u32,
-    /// Since when it has been matched in every frame; of old if it is missed now.
-    pub matched_since: MediaTime,
+    /// Since when it has been matched in every frame; `None` when the last counted frame missed it.
+    pub matched_since: Option<MediaTime>,
     /// Running mean of the length of its innovations `(dx/h, dy/h)`.
     pub mean_innovation: f64,
     /// Whether it was believed once; never taken back.
@@ -91,8 +89,7 @@ impl Tracklet {
             born: time,
             frames: 1,
             hits: 1,
-            missed_frames: 0,
-            matched_since: time,
+            matched_since: Some(time),
             mean_innovation: TYPICAL_INNOVATION,
             confirmed: false,
             matched: true,
@@ -131,10 +128,7 @@ impl Tracklet {
         }
         self.history.push_back(Observation { bbox: seen, time, score: detection.score, innovation });
         self.mean_innovation += 0.2 * (innovation[0].hypot(innovation[1]) - self.mean_innovation);
-        if self.missed_frames > 0 {
-            self.matched_since = time;
-        }
-        self.missed_frames = 0;
+        self.matched_since.get_or_insert(time);
         let r = measurement_noise(config, predicted.h, config.adaptation.measurement_factor(link));
         self.filter.update([seen.cx(), seen.cy(), seen.w, seen.h], r);
         self.hits = self.hits.saturating_add(1);
@@ -147,7 +141,7 @@ impl Tracklet {
     pub fn count_frame(&mut self) {
         self.frames = self.frames.saturating_add(1);
         if !self.matched {
-            self.missed_frames = self.missed_frames.saturating_add(1);
+            self.matched_since = None;
         }
     }
 
