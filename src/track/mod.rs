@@ -22,6 +22,7 @@ pub mod gate;
 pub mod kalman;
 mod link;
 pub mod motion;
+pub mod nearby;
 pub mod shift;
 mod tracker;
 pub mod tracklet;

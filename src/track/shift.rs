@@ -5,26 +5,30 @@
 //! else is decided.
 
 use super::ShiftConfig;
-use super::assign::assign;
+use super::association::match_pairs;
+use super::nearby::Nearby;
 use crate::types::BBox;
 
 /// The shift `(dx, dy)` in pixels from `predicted` boxes to `detections`; `None` when too few agree.
-pub fn global_shift(config: &ShiftConfig, predicted: &[BBox], detections: &[BBox]) -> Option<(f64, f64)> {
+pub fn global_shift(config: &ShiftConfig, predicted: &[BBox], detections: &Nearby) -> Option<(f64, f64)> {
     if !config.enabled || predicted.len() < config.min_pairs || detections.len() < config.min_pairs {
         return None;
     }
-    let cost: Vec<f64> = predicted
-        .iter()
-        .flat_map(|p| detections.iter().map(move |d| p.iou(d)))
-        .map(|iou| if iou > config.min_iou { -iou } else { 0.0 })
-        .collect();
-    let mut dx = Vec::with_capacity(predicted.len());
-    let mut dy = Vec::with_capacity(predicted.len());
-    for (row, col) in assign(&cost, predicted.len(), detections.len()).into_iter().enumerate() {
-        let Some(col) = col.filter(|col| cost[row * detections.len() + col] < 0.0) else { continue };
-        dx.push(detections[col].cx() - predicted[row].cx());
-        dy.push(detections[col].cy() - predicted[row].cy());
+    let mut pairs = Vec::with_capacity(2 * predicted.len());
+    let mut moves = Vec::with_capacity(2 * predicted.len());
+    let mut last = 0;
+    for (track, bbox) in predicted.iter().enumerate() {
+        for (detection, seen) in detections.boxes_touching(bbox) {
+            let iou = bbox.iou(seen);
+            if iou > config.min_iou {
+                pairs.push((track, detection, iou));
+                moves.push((seen.cx() - bbox.cx(), seen.cy() - bbox.cy()));
+                last = last.max(detection + 1);
+            }
+        }
     }
+    let (mut dx, mut dy): (Vec<f64>, Vec<f64>) =
+        match_pairs(&pairs, predicted.len(), last).into_iter().map(|chosen| moves[chosen]).unzip();
     let n = dx.len();
     if n < config.min_pairs {
         return None;
@@ -48,17 +52,23 @@ mod tests {
         (0..5).map(|i| BBox::new(100.0 * f64::from(i) + shift, 50.0, 40.0, 100.0)).collect()
     }
 
+    fn nearby(boxes: &[BBox]) -> Nearby {
+        let mut nearby = Nearby::default();
+        nearby.fill(boxes.iter().copied().enumerate());
+        nearby
+    }
+
     #[test]
     fn finds_a_pan_and_ignores_one_runner() {
         let mut moved = people(8.0);
         moved[2] = moved[2].shifted(12.0, 0.0);
-        let (dx, dy) = global_shift(&ShiftConfig::default(), &people(0.0), &moved).unwrap();
+        let (dx, dy) = global_shift(&ShiftConfig::default(), &people(0.0), &nearby(&moved)).unwrap();
         assert!((dx - 8.0 * 5.0 / 5.3).abs() < 1e-9 && dy == 0.0, "{dx} {dy}");
     }
 
     #[test]
     fn says_nothing_of_two_people() {
-        assert_eq!(global_shift(&ShiftConfig::default(), &people(0.0)[..2], &people(5.0)), None);
-        assert_eq!(global_shift(&ShiftConfig::default(), &people(0.0), &people(5000.0)), None);
+        assert_eq!(global_shift(&ShiftConfig::default(), &people(0.0)[..2], &nearby(&people(5.0))), None);
+        assert_eq!(global_shift(&ShiftConfig::default(), &people(0.0), &nearby(&people(5000.0))), None);
     }
 }

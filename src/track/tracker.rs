@@ -6,6 +6,7 @@ use super::existence;
 use super::features;
 use super::gate::PairGeometry;
 use super::link::{LinkRequest, Pair};
+use super::nearby::Nearby;
 use super::shift::global_shift;
 use super::tracklet::Tracklet;
 use crate::types::{BBox, Detection, Embedding, MediaTime, TrackId, TrackReport};
@@ -87,6 +88,8 @@ pub struct Tracker {
     predicted: Vec<BBox>,
     detections: Vec<Detection>,
     embeddings: Vec<Option<Embedding>>,
+    /// Detections of the first stages, those that score high.
+    high: Nearby,
     pairs: Vec<GatedPair>,
 }
 
@@ -103,6 +106,7 @@ impl Tracker {
             predicted: Vec::new(),
             detections: Vec::new(),
             embeddings: Vec::new(),
+            high: Nearby::default(),
             pairs: Vec::new(),
         }
     }
@@ -262,6 +266,9 @@ impl Tracker {
         if frame.embeddings.len() == frame.detections.len() {
             self.embeddings.extend(order.iter().map(|&i| frame.embeddings[i].clone()));
         }
+        let high = self.config.association.high_score;
+        let boxes = self.detections.iter().map(|d| (d.score, d.bbox)).enumerate();
+        self.high.fill(boxes.filter(|(_, (score, _))| *score >= high).map(|(i, (_, bbox))| (i, bbox)));
     }
 
     /// Moves every track by the camera's own motion.
@@ -273,13 +280,7 @@ impl Tracker {
             .filter(|t| t.matched && t.hits >= config.min_hits)
             .map(Tracklet::bbox)
             .collect();
-        let high: Vec<BBox> = self
-            .detections
-            .iter()
-            .filter(|d| d.score >= self.config.association.high_score)
-            .map(|d| d.bbox)
-            .collect();
-        if let Some((dx, dy)) = global_shift(config, &seen, &high) {
+        if let Some((dx, dy)) = global_shift(config, &seen, &self.high) {
             for track in &mut self.tracks {
                 track.shift(dx, dy);
             }
@@ -290,11 +291,14 @@ impl Tracker {
         request.clear();
         self.pairs.clear();
         let asks = self.config.association.method.asks_scorer();
+        let mut near = Vec::new();
         for (index, (track, predicted)) in self.tracks.iter().zip(&self.predicted).enumerate() {
             let r = track.measurement_noise(&self.config.filter);
             let first = self.pairs.len();
-            for (d, detection) in self.detections.iter().enumerate() {
-                if detection.score < self.config.association.high_score || detection.class != track.class {
+            association::near(&self.config, track, predicted, r, &self.high, &mut near);
+            for &d in &near {
+                let detection = &self.detections[d];
+                if detection.class != track.class {
                     continue;
                 }
                 let open = association::gate(&self.config, track, predicted, r, &detection.bbox);

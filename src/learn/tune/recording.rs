@@ -8,6 +8,7 @@ use crate::learn::dataset::{self, DatasetError, Owner};
 use crate::mot::{Sequence, SequenceInfo, first_half_length, parse_truth};
 use crate::track::kalman::BoxFilter;
 use crate::track::motion::{measurement_noise, motion, newborn};
+use crate::track::nearby::Nearby;
 use crate::track::shift::global_shift;
 use crate::track::{FrameInput, LifeConfig, LinkRequest, ShiftConfig, Tracker, TrackerConfig};
 use crate::types::{BBox, MediaTime};
@@ -193,6 +194,7 @@ impl Recording {
             hits: u32,
         }
         let mut live: Vec<Option<Live>> = self.people.iter().map(|_| None).collect();
+        let mut detected = Nearby::default();
         for frame in 0..self.times.len() {
             let time = self.times[frame];
             let dt = if frame == 0 { 0.0 } else { time - self.times[frame - 1] };
@@ -212,7 +214,7 @@ impl Recording {
                     }
                 }
             }
-            let detected: Vec<BBox> = seen.iter().flatten().map(|z| bbox(*z)).collect();
+            detected.fill(seen.iter().flatten().map(|z| bbox(*z)).enumerate());
             let (dx, dy) = global_shift(&shift, &predicted, &detected).unwrap_or_default();
             self.shifts[frame] = [dx, dy];
             for (slot, seen) in live.iter_mut().zip(seen) {

@@ -31,6 +31,7 @@ pub use matching::{Match, match_pairs};
 
 use super::TrackerConfig;
 use super::gate::{self, PairGeometry};
+use super::nearby::Nearby;
 use super::tracklet::Tracklet;
 use crate::types::{BBox, Detection, Embedding};
 
@@ -179,6 +180,24 @@ pub fn affinity(config: &TrackerConfig, pair: &PairView<'_>, probability: Option
         Association::Implicit => implicit::affinity(config, pair, probability.unwrap_or(0.0)),
         Association::Huang => huang::affinity(pair),
         Association::Mahalanobis => mahalanobis::affinity(config.gate.mahalanobis, pair),
+    }
+}
+
+/// Writes the numbers of the detections that [`gate()`] may let through to `numbers`, which is emptied
+/// first; in increasing order.
+pub fn near(
+    config: &TrackerConfig,
+    track: &Tracklet,
+    predicted: &BBox,
+    r: [f64; 4],
+    detections: &Nearby,
+    numbers: &mut Vec<usize>,
+) {
+    if config.association.method.uses_motion() {
+        let reach = gate::reach(&config.gate, &track.filter, r);
+        detections.within(predicted.cx(), reach, numbers);
+    } else {
+        detections.touching(&track.last().bbox, numbers);
     }
 }
 
