@@ -41,6 +41,8 @@ pub mod publish;
 
 pub mod mot;
 
+#[cfg(any(feature = "cli", feature = "learn"))]
+pub mod chart;
 #[cfg(feature = "learn")]
 pub mod learn;
 

@@ -6,11 +6,11 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use super::linker::LinkModel;
-use super::models::{Chosen, Plan, Reid};
+use super::models::{Chosen, Plan, Reid, link_alone};
 use super::{Arrangement, BatchModel, InferError, ModelSettings, Task};
 use crate::detect::{DetectModel, DetectSpec};
 use crate::embed::{EmbedJob, EmbedModel, NetworkModel};
-use crate::track::LinkRequest;
+use crate::track::{LinkRequest, TrackerConfig};
 use crate::types::{BBox, Image};
 
 /// What the models are asked about one frame.
@@ -117,6 +117,36 @@ pub fn models_alone(
         }
         Ok(report)
     })
+}
+
+/// The link scorer on the caller's thread: no queue and no worker, one single-threaded session.
+pub struct LinkAlone(LinkModel);
+
+impl LinkAlone {
+    /// Loads the link scorer that `settings` name.
+    ///
+    /// # Errors
+    /// As [`super::Linker::load`].
+    pub fn load(settings: &ModelSettings) -> Result<Self, InferError> {
+        let (runtime, Chosen { entry, file }) = link_alone(settings)?;
+        Ok(Self(LinkModel::load(&runtime, &entry.name, &file)?))
+    }
+
+    /// As [`super::Linker::calibrate`].
+    pub fn calibrate(&self, mut tracker: TrackerConfig) -> TrackerConfig {
+        tracker.existence.head = self.0.existence.clone();
+        tracker
+    }
+
+    /// As [`super::Linker::score`].
+    ///
+    /// # Errors
+    /// The model's failure.
+    pub fn score(&mut self, request: &LinkRequest) -> Result<Vec<f32>, InferError> {
+        super::linker::check(request)?;
+        let mut answers = self.0.run(std::slice::from_ref(request))?;
+        Ok(answers.pop().unwrap_or_default())
+    }
 }
 
 /// One thread's models.

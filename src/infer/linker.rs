@@ -151,7 +151,7 @@ fn warm_up() -> LinkRequest {
 /// One instance of the link scorer.
 pub(super) struct LinkModel {
     session: Session,
-    existence: Option<Arc<ExistenceHead>>,
+    pub(super) existence: Option<Arc<ExistenceHead>>,
     /// The joined request of a batch.
     joined: LinkRequest,
     pair_track: Vec<i64>,

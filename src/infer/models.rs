@@ -274,13 +274,19 @@ impl Linker {
     /// # Errors
     /// As [`Models::load`]; also when `settings.link` is `none`.
     pub fn load(settings: &ModelSettings, observer: Arc<dyn Observer>) -> Result<Self, InferError> {
-        let manifest = Manifest::read(&manifest_path(settings))?;
-        let Chosen { entry, file } = choose(&manifest, Task::Link, &settings.link)?;
-        let folder = manifest.path().parent().unwrap_or(Path::new(""));
-        let runtime = Runtime::load(settings.provider, settings.onnxruntime.as_deref(), folder)?;
+        let (runtime, Chosen { entry, file }) = link_alone(settings)?;
         let arrangement = runtime.provider.arrangement(Task::Link, settings.threads);
         Self::start(&runtime, &entry, &file, arrangement, observer)
     }
+}
+
+/// The link scorer that `settings` name, and a runtime for it.
+pub(super) fn link_alone(settings: &ModelSettings) -> Result<(Runtime, Chosen), InferError> {
+    let manifest = Manifest::read(&manifest_path(settings))?;
+    let chosen = choose(&manifest, Task::Link, &settings.link)?;
+    let folder = manifest.path().parent().unwrap_or(Path::new(""));
+    let runtime = Runtime::load(settings.provider, settings.onnxruntime.as_deref(), folder)?;
+    Ok((runtime, chosen))
 }
 
 /// The manifest's file.

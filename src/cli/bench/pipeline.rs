@@ -1,15 +1,15 @@
-//! `gakp bench`: speed beside its limit, and beside a peer doing the same job, in one run.
+//! `gakp bench pipeline`: the whole offline run beside the models alone, and beside a peer.
 
 use std::ops::ControlFlow;
 use std::path::Path;
-use std::process::Command;
 use std::sync::{Arc, mpsc};
 
 use anyhow::{Context, Result, bail, ensure};
 use serde::Serialize;
 
-use super::models::ModelArgs;
-use super::track::{Job, Output, track_video};
+use super::super::models::ModelArgs;
+use super::super::track::{Job, Output, track_video};
+use super::{run_peer, spread};
 use crate::config::{ModelConfig, TrackerOptions};
 use crate::infer::bench::{AloneReport, FrameWork, models_alone};
 use crate::infer::{ModelSettings, Models};
@@ -17,25 +17,11 @@ use crate::ingest::{self, Pacing, SourceEvent, SourceSpec};
 use crate::track::{FrameInput, LinkRequest, Tracker, TrackerConfig};
 use crate::types::{CameraId, Image, MediaTime};
 
-/// Measures speed beside its limit.
-#[derive(Clone, Debug, clap::Args)]
-pub struct Args {
-    #[command(subcommand)]
-    what: What,
-}
-
-/// What to measure.
-#[derive(Clone, Debug, clap::Subcommand)]
-enum What {
-    /// The whole offline run against the models alone on the same frames, and against a peer.
-    Pipeline(PipelineArgs),
-}
-
 /// The models alone are the detector (its input prepared beforehand), the appearance model and the link
 /// scorer, run on the video's own frames, boxes and pairs, on as many threads as the provider's
 /// arrangement has. The runs alternate, so that a machine that slows down slows all of them.
 #[derive(Clone, Debug, clap::Args)]
-struct PipelineArgs {
+pub struct Args {
     /// Video file.
     video: String,
     /// Rounds; medians are printed.
@@ -51,17 +37,7 @@ struct PipelineArgs {
     models: ModelArgs,
 }
 
-/// Runs the command.
-///
-/// # Errors
-/// The video, a model or the peer fails.
-pub fn run(args: Args) -> Result<()> {
-    match args.what {
-        What::Pipeline(args) => pipeline(args),
-    }
-}
-
-/// One round of `bench pipeline`.
+/// One round.
 struct Round {
     whole: f64,
     alone: AloneReport,
@@ -92,7 +68,11 @@ struct Report {
     peer_ratio: Option<[f64; 3]>,
 }
 
-fn pipeline(args: PipelineArgs) -> Result<()> {
+/// Runs the command.
+///
+/// # Errors
+/// The video, a model or the peer fails.
+pub fn run(args: Args) -> Result<()> {
     ensure!(args.rounds > 0, "--rounds is 0: give at least 1");
     let settings = ModelConfig::from(args.models).settings()?;
     let frames = decode(&args.video)?;
@@ -188,29 +168,12 @@ fn frame_work(frames: &[(Image, MediaTime)], settings: &ModelSettings) -> Result
     Ok(work)
 }
 
-/// Runs a peer and reads the first `X frames/s` that it prints.
+/// The first `X frames/s` that a peer prints.
 fn peer_fps(command: &str) -> Result<f64> {
-    let output = Command::new("sh").arg("-c").arg(command).output().context("cannot run the peer")?;
-    let text = String::from_utf8_lossy(&output.stdout);
-    ensure!(
-        output.status.success(),
-        "the peer failed ({}): {}",
-        output.status,
-        String::from_utf8_lossy(&output.stderr).trim()
-    );
+    let text = run_peer(command)?;
     let words: Vec<&str> = text.split_whitespace().collect();
     let fps = words.windows(2).find(|w| w[1] == "frames/s").and_then(|w| w[0].parse().ok());
     fps.with_context(|| format!("the peer printed no `X frames/s`: {}", text.trim()))
-}
-
-/// Median, least and most.
-fn spread(values: impl Iterator<Item = f64>) -> [f64; 3] {
-    let mut sorted: Vec<f64> = values.collect();
-    sorted.sort_by(f64::total_cmp);
-    let middle = sorted.len() / 2;
-    let median =
-        if sorted.len() % 2 == 1 { sorted[middle] } else { (sorted[middle - 1] + sorted[middle]) / 2.0 };
-    [median, sorted[0], sorted[sorted.len() - 1]]
 }
 
 fn report(video: String, rounds: &[Round]) -> Report {
