@@ -13,14 +13,17 @@ pub struct PairGeometry {
     pub iou: f64,
 }
 
-/// How far from the predicted centre, horizontally, a detection may be that [`gate`] lets through, pixels.
-pub fn reach(config: &GateConfig, filter: &BoxFilter, r: [f64; 4]) -> f64 {
+/// How far from the predicted centre, along x and y, a detection may be that [`gate`] lets through, pixels.
+pub fn reach(config: &GateConfig, filter: &BoxFilter, r: [f64; 4]) -> [f64; 2] {
     if config.or_iou.is_some() || config.or_distance.is_some() {
-        return f64::INFINITY;
+        return [f64::INFINITY; 2];
     }
-    let s = filter.variances()[0] + if config.innovation { r[0] } else { 0.0 };
-    // A little more, for rounding.
-    (config.mahalanobis * s).sqrt() * (1.0 + 1e-9) + 1e-9
+    let variances = filter.variances();
+    [0, 1].map(|axis| {
+        let s = variances[axis] + if config.innovation { r[axis] } else { 0.0 };
+        // A little more, for rounding.
+        (config.mahalanobis * s).sqrt() * (1.0 + 1e-9) + 1e-9
+    })
 }
 
 /// Measures a pair: `filter` is predicted to the detection's time, `predicted` is its box, `r` the
@@ -57,17 +60,18 @@ mod tests {
         #[test]
         fn nothing_beyond_its_reach_passes(
             place in (0.0f64..4000.0, 0.0f64..200.0, 4.0f64..400.0),
-            off in (-600.0f64..600.0, -3.0f64..3.0),
+            off in (-600.0f64..600.0, -600.0f64..600.0, 0.0f64..1.0),
             innovation in any::<bool>(),
         ) {
-            let ((x, y, h), (dx, dy)) = (place, off);
+            let ((x, y, h), (dx, dy, k)) = (place, off);
             let (filter_config, config) =
                 (FilterConfig::default(), GateConfig { innovation, ..GateConfig::default() });
             let filter = newborn(&filter_config, [x, y, 0.4 * h, h]);
             let r = measurement_noise(&filter_config, h, 1.0);
-            let [predicted, seen] = [0.0, 1.0].map(|k| BBox::from_center(x + k * dx, y + k * dy, 0.4 * h, h));
+            let [predicted, seen] = [0.0, k * k].map(|k| BBox::from_center(x + k * dx, y + k * dy, 0.4 * h, h));
             let passes = gate(&config, &filter, &predicted, r, &seen).is_some();
-            let far = (seen.cx() - predicted.cx()).abs() > reach(&config, &filter, r);
+            let [rx, ry] = reach(&config, &filter, r);
+            let far = (seen.cx() - predicted.cx()).abs() > rx || (seen.cy() - predicted.cy()).abs() > ry;
             prop_assert!(!(passes && far));
         }
     }

@@ -6,28 +6,58 @@ use nalgebra::Matrix2;
 use super::FilterConfig;
 use super::kalman::{Axis, AxisMotion, BoxFilter};
 
-/// `F` and `Q*` of the four coordinates `(cx, cy, w, h)` over `dt` seconds (not negative) for a box
-/// `height` pixels tall. `factor` is the adaptation of Eq. Q*.
-///
-/// Centre: `F = [1 dt; 0 1]`, white acceleration `q [dt^3/3 dt^2/2; dt^2/2 dt]` and a random walk of
-/// the position. Size: the same, its velocity decaying with time constant `tau`.
+/// A step in time: what is the same for every box.
+#[derive(Clone, Copy, Debug)]
+pub struct Step<'a> {
+    config: &'a FilterConfig,
+    dt: f64,
+    /// White acceleration of unit variance: `[dt^3/3 dt^2/2; dt^2/2 dt]`.
+    acceleration: Matrix2<f64>,
+    centre: Matrix2<f64>,
+    size: Matrix2<f64>,
+}
+
+impl<'a> Step<'a> {
+    /// A step of `dt` seconds (not negative).
+    pub fn new(config: &'a FilterConfig, dt: f64) -> Self {
+        let tau = config.size_velocity_decay;
+        let decay = (-dt / tau).exp();
+        Self {
+            config,
+            dt,
+            acceleration: Matrix2::new(dt.powi(3) / 3.0, dt * dt / 2.0, dt * dt / 2.0, dt),
+            centre: Matrix2::new(1.0, dt, 0.0, 1.0),
+            size: Matrix2::new(1.0, tau * (1.0 - decay), 0.0, decay),
+        }
+    }
+
+    /// The filter that it is a step of.
+    pub fn config(&self) -> &'a FilterConfig {
+        self.config
+    }
+
+    /// `F` and `Q*` of the four coordinates `(cx, cy, w, h)` for a box `height` pixels tall. `factor` is
+    /// the adaptation of Eq. Q*.
+    ///
+    /// Centre: `F = [1 dt; 0 1]`, white acceleration `q [dt^3/3 dt^2/2; dt^2/2 dt]` and a random walk of
+    /// the position. Size: the same, its velocity decaying with time constant `tau`.
+    pub fn motion(&self, height: f64, factor: f64) -> [AxisMotion; 4] {
+        let noise = |acceleration: f64, walk: f64| {
+            let mut Q = self.acceleration * ((acceleration * height).powi(2) * factor);
+            Q[(0, 0)] += (walk * height).powi(2) * self.dt * factor;
+            Q
+        };
+        let FilterConfig { centre_acceleration, centre_walk, size_acceleration, size_walk, .. } =
+            *self.config;
+        let centre = AxisMotion { F: self.centre, Q: noise(centre_acceleration, centre_walk) };
+        let size = AxisMotion { F: self.size, Q: noise(size_acceleration, size_walk) };
+        [centre, centre, size, size]
+    }
+}
+
+/// [`Step::motion`] of one box alone.
 pub fn motion(config: &FilterConfig, dt: f64, height: f64, factor: f64) -> [AxisMotion; 4] {
-    let noise = |acceleration: f64, walk: f64| {
-        let q = (acceleration * height).powi(2) * factor;
-        let w = (walk * height).powi(2) * dt * factor;
-        Matrix2::new(q * dt.powi(3) / 3.0 + w, q * dt * dt / 2.0, q * dt * dt / 2.0, q * dt)
-    };
-    let tau = config.size_velocity_decay;
-    let decay = (-dt / tau).exp();
-    let centre = AxisMotion {
-        F: Matrix2::new(1.0, dt, 0.0, 1.0),
-        Q: noise(config.centre_acceleration, config.centre_walk),
-    };
-    let size = AxisMotion {
-        F: Matrix2::new(1.0, tau * (1.0 - decay), 0.0, decay),
-        Q: noise(config.size_acceleration, config.size_walk),
-    };
-    [centre, centre, size, size]
+    Step::new(config, dt).motion(height, factor)
 }
 
 /// Diagonal of `R` for a box `height` pixels tall, pixels^2. `factor` is the adaptation of Eq. R*.

@@ -18,7 +18,7 @@ pub fn global_shift(config: &ShiftConfig, predicted: &[BBox], detections: &Nearb
     let mut moves = Vec::with_capacity(2 * predicted.len());
     let mut last = 0;
     for (track, bbox) in predicted.iter().enumerate() {
-        for (detection, seen) in detections.boxes_touching(bbox) {
+        for (detection, seen) in detections.touching(bbox) {
             let iou = bbox.iou(seen);
             if iou > config.min_iou {
                 pairs.push((track, detection, iou));

@@ -6,6 +6,7 @@ use super::existence;
 use super::features;
 use super::gate::PairGeometry;
 use super::link::{LinkRequest, Pair};
+use super::motion::Step;
 use super::nearby::Nearby;
 use super::shift::global_shift;
 use super::tracklet::Tracklet;
@@ -139,9 +140,12 @@ impl Tracker {
         self.take_detections(&frame);
         self.awaiting = true;
         self.size = (frame.width, frame.height);
-        self.time = self.time.max(frame.time);
+        // Every track stands at the last frame's time.
+        let time = self.time.max(frame.time);
+        let step = Step::new(&self.config.filter, time.since(self.time));
+        self.time = time;
         for track in &mut self.tracks {
-            track.predict(self.time, &self.config.filter);
+            track.predict(time, &step);
         }
         self.follow_camera();
         for track in &mut self.tracks {
@@ -291,12 +295,10 @@ impl Tracker {
         request.clear();
         self.pairs.clear();
         let asks = self.config.association.method.asks_scorer();
-        let mut near = Vec::new();
         for (index, (track, predicted)) in self.tracks.iter().zip(&self.predicted).enumerate() {
             let r = track.measurement_noise(&self.config.filter);
             let first = self.pairs.len();
-            association::near(&self.config, track, predicted, r, &self.high, &mut near);
-            for &d in &near {
+            for (d, _) in association::near(&self.config, track, predicted, r, &self.high) {
                 let detection = &self.detections[d];
                 if detection.class != track.class {
                     continue;

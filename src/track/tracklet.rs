@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use super::config::{FilterConfig, LifeConfig};
 use super::kalman::BoxFilter;
 use super::link::HISTORY;
-use super::motion::{measurement_noise, motion, newborn};
+use super::motion::{Step, measurement_noise, newborn};
 use crate::types::{BBox, ClassId, Detection, Embedding, MediaTime, TrackId, TrackState};
 
 /// Where the running mean of innovations begins, heights.
@@ -98,14 +98,12 @@ impl Tracklet {
         }
     }
 
-    /// Moves the filter to `time` (Eq. mean_prediction, covariance_prediction with Q*).
-    pub fn predict(&mut self, time: MediaTime, config: &FilterConfig) {
-        let dt = time.since(self.time).max(0.0);
-        let height = self.bbox().h;
-        let link = if !self.matched && config.adaptation.zero_when_missed { 0.0 } else { self.link };
-        let factor = config.adaptation.process_factor(link);
-        self.filter.predict(&motion(config, dt, height, factor));
-        self.time = self.time.max(time);
+    /// Moves the filter by `step` to `time` (Eq. mean_prediction, covariance_prediction with Q*).
+    pub fn predict(&mut self, time: MediaTime, step: &Step<'_>) {
+        let adaptation = &step.config().adaptation;
+        let link = if !self.matched && adaptation.zero_when_missed { 0.0 } else { self.link };
+        self.filter.predict(&step.motion(self.bbox().h, adaptation.process_factor(link)));
+        self.time = time;
     }
 
     /// The filter's box now; its size is kept at one pixel at least.

@@ -20,19 +20,42 @@ pub struct Match {
 /// total gain. Gains are positive and finite; a pair that must not match is simply not in `pairs`.
 /// Returns indices into `pairs`, in increasing order.
 pub fn match_pairs(pairs: &[(usize, usize, f64)], tracks: usize, detections: usize) -> Vec<usize> {
-    let mut component = UnionFind::new(tracks + detections);
-    for &(track, detection, _) in pairs {
-        component.join(track, tracks + detection);
+    if pairs.is_empty() {
+        return Vec::new();
     }
-    let mut grouped: Vec<(usize, usize)> =
-        pairs.iter().enumerate().map(|(i, &(track, _, _))| (component.root(track), i)).collect();
-    grouped.sort_unstable();
-    let mut chosen = Vec::new();
-    for group in grouped.chunk_by(|a, b| a.0 == b.0) {
-        if let [(_, only)] = group {
-            chosen.push(*only);
+    let mut rivals = vec![0u32; tracks + detections];
+    for &(track, detection, _) in pairs {
+        rivals[track] += 1;
+        rivals[tracks + detection] += 1;
+    }
+    let mut chosen = Vec::with_capacity(tracks.min(detections));
+    let mut contested = Vec::new();
+    for (i, &(track, detection, _)) in pairs.iter().enumerate() {
+        if rivals[track] == 1 && rivals[tracks + detection] == 1 {
+            chosen.push(i);
         } else {
-            solve_component(pairs, group.iter().map(|&(_, i)| i), &mut chosen);
+            contested.push(i);
+        }
+    }
+    if !contested.is_empty() {
+        let mut component = UnionFind::new(tracks + detections);
+        for &i in &contested {
+            component.join(pairs[i].0, tracks + pairs[i].1);
+        }
+        let mut grouped: Vec<(usize, usize)> =
+            contested.into_iter().map(|i| (component.root(pairs[i].0), i)).collect();
+        grouped.sort_unstable();
+        for group in grouped.chunk_by(|a, b| a.0 == b.0) {
+            let members = group.iter().map(|&(_, i)| i);
+            let (track, detection, _) = pairs[group[0].1];
+            let star = members.clone().all(|i| pairs[i].0 == track)
+                || members.clone().all(|i| pairs[i].1 == detection);
+            if star {
+                // All want the same track, or the same detection: the best of them has it.
+                chosen.extend(members.max_by(|&a, &b| pairs[a].2.total_cmp(&pairs[b].2)));
+            } else {
+                solve_component(pairs, members, &mut chosen);
+            }
         }
     }
     chosen.sort_unstable();

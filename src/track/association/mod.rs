@@ -183,22 +183,21 @@ pub fn affinity(config: &TrackerConfig, pair: &PairView<'_>, probability: Option
     }
 }
 
-/// Writes the numbers of the detections that [`gate()`] may let through to `numbers`, which is emptied
-/// first; in increasing order.
-pub fn near(
+/// The detections that [`gate()`] may let through, and no more than a few others: number and box.
+pub fn near<'a>(
     config: &TrackerConfig,
     track: &Tracklet,
     predicted: &BBox,
     r: [f64; 4],
-    detections: &Nearby,
-    numbers: &mut Vec<usize>,
-) {
-    if config.association.method.uses_motion() {
-        let reach = gate::reach(&config.gate, &track.filter, r);
-        detections.within(predicted.cx(), reach, numbers);
+    detections: &'a Nearby,
+) -> impl Iterator<Item = (usize, &'a BBox)> {
+    let (centre, reach) = if config.association.method.uses_motion() {
+        (predicted, gate::reach(&config.gate, &track.filter, r))
     } else {
-        detections.touching(&track.last().bbox, numbers);
-    }
+        let last = &track.last().bbox;
+        (last, detections.reach(last))
+    };
+    detections.within([centre.cx(), centre.cy()], reach)
 }
 
 /// Whether the pair is looked at; see [`gate::gate`] for the arguments.
