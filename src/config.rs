@@ -279,7 +279,7 @@ impl TrackerOptions {
         }
         match self.cost.as_deref() {
             None => {}
-            Some("blend") => base.association.score = PairScore::Blend { iou_weight: 0.3 },
+            Some("blend") => base.association.score = PairScore::default(),
             Some("log-link") => base.association.score = PairScore::LogLink,
             Some(other) => bail!("tracker.cost = {other:?}: must be \"blend\" or \"log-link\""),
         }

@@ -31,7 +31,7 @@ pub mod config;
 pub mod pipeline;
 #[cfg(feature = "service")]
 pub mod telemetry;
-#[cfg(any(feature = "service", feature = "cli"))]
+#[cfg(any(feature = "cli", feature = "infer", feature = "service"))]
 pub mod tuning;
 
 #[cfg(feature = "service")]

@@ -131,10 +131,8 @@ impl Tuning {
             fs::read_to_string(path).map_err(|source| TuningError::Read { path: path.to_owned(), source })?;
         let tuning: Self = toml::from_str(&text)
             .map_err(|error| TuningError::Parse { path: path.to_owned(), message: error.to_string() })?;
-        for (key, value) in tuning.filter.entries() {
-            if let Some(value) = value.filter(|v| !(v.is_finite() && *v > MIN && *v <= MAX)) {
-                return Err(TuningError::Value { path: path.to_owned(), key, value });
-            }
+        if let Some((key, value)) = tuning.filter.mistake() {
+            return Err(TuningError::Value { path: path.to_owned(), key, value });
         }
         Ok(tuning)
     }
@@ -149,6 +147,32 @@ impl Tuning {
 }
 
 impl FilterTuning {
+    /// Reads the text of a `[filter]` table: what a link network's file carries.
+    ///
+    /// # Errors
+    /// What is wrong with it.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        let filter: Self = toml::from_str(text).map_err(|error| error.to_string())?;
+        match filter.mistake() {
+            Some((key, value)) => Err(format!("{key} = {value}: must be more than {MIN} and at most {MAX}")),
+            None => Ok(filter),
+        }
+    }
+
+    /// The text that [`FilterTuning::parse`] reads.
+    ///
+    /// # Errors
+    /// As [`Tuning::to_toml`].
+    pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
+        toml::to_string(self)
+    }
+
+    /// The first number that no filter can work with.
+    fn mistake(&self) -> Option<(&'static str, f64)> {
+        let set = self.entries().into_iter().filter_map(|(key, value)| Some((key, value?)));
+        { set }.find(|(_, v)| !(v.is_finite() && *v > MIN && *v <= MAX))
+    }
+
     /// Everything that `filter` says, but for its adaptation.
     pub fn of(filter: &FilterConfig) -> Self {
         Self {
@@ -226,6 +250,18 @@ mod tests {
         // The adaptation is the tracker's own: a tuning leaves it alone.
         let applied = tuning.filter.apply(FilterConfig::default());
         assert_eq!(applied, FilterConfig { adaptation: Default::default(), ..filter });
+    }
+
+    #[test]
+    fn a_table_in_a_network_is_checked_as_a_file_is() {
+        let filter = FilterTuning::of(&FilterConfig::hand_set());
+        assert_eq!(FilterTuning::parse(&filter.to_toml().expect("TOML")), Ok(filter));
+        for (text, expected) in
+            [("size_walk = -1.0", "size_walk = -1: must be more"), ("x = 1", "unknown field")]
+        {
+            let message = FilterTuning::parse(text).expect_err(text);
+            assert!(message.contains(expected), "{message}");
+        }
     }
 
     #[test]

@@ -47,7 +47,7 @@ fn write_sequence(root: &Path, name: &str, features: bool) {
     let (mut rows, mut values) = (0, Vec::new());
     for frame in 1..=80u32 {
         for person in 0..6u32 {
-            let phase = f64::from(frame) * 0.06 + f64::from(person) * 1.7;
+            let phase = f64::from(frame) * 0.02 + f64::from(person) * 1.7;
             let (x, y) = (300.0 + 250.0 * phase.sin(), 100.0 + 30.0 * f64::from(person));
             writeln!(truth, "{frame},{person},{x:.2},{y:.2},40,100,1,1,1").expect("written");
             if (frame + 4 * person) % 9 != 0 {

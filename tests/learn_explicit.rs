@@ -6,7 +6,8 @@ mod learn_common;
 
 use gakp::learn::explicit::{Run, backward, encode, logit};
 use gakp::learn::{
-    Examples, ExplicitModel, ExplicitScorer, ExplicitShape, Fit, fit_explicit, logits_explicit, metrics,
+    Examples, ExplicitModel, ExplicitScorer, ExplicitShape, Fit, Split, fit_explicit, logits_explicit,
+    metrics,
 };
 use gakp::track::association::explicit::COSTS;
 use gakp::track::{CANDIDATE_FEATURES, HISTORY, LinkRequest, STEP_FEATURES, features};
@@ -100,7 +101,7 @@ fn weights_are_positive_and_follow_the_history() {
     let mut rng = fastrand::Rng::with_seed(3);
     let (seen, unseen) = (examples(300, &mut rng), examples(50, &mut rng));
     let settings = Fit { hidden: 12, epochs: 12, batch: 64, rate: 0.01, ..Fit::default() };
-    let model = fit_explicit(&seen, &settings, |_| {});
+    let (model, _) = fit_explicit(&seen.into(), &settings, None, |_| {});
     let found = metrics::scores(&logits_explicit(&model, &unseen), unseen.labels(), unseen.weights());
     assert!(found.auc > 0.95, "area under the curve on unseen examples: {}", found.auc);
     let (mut scorer, request) = (ExplicitScorer::new(model), real(12, 1, &mut rng));
@@ -118,13 +119,13 @@ fn weights_are_positive_and_follow_the_history() {
 #[test]
 fn the_same_bits_for_any_number_of_threads() {
     let mut rng = fastrand::Rng::with_seed(5);
-    let examples = examples(8, &mut rng);
+    let examples = Split::from(examples(8, &mut rng));
     let settings = |threads, seed| Fit { hidden: 6, epochs: 1, batch: 61, threads, seed, ..Fit::default() };
-    let one = fit_explicit(&examples, &settings(1, 1), |_| {});
+    let one = fit_explicit(&examples, &settings(1, 1), None, |_| {});
     for threads in 2..=4 {
-        assert_eq!(one, fit_explicit(&examples, &settings(threads, 1), |_| {}), "{threads} threads");
+        assert_eq!(one, fit_explicit(&examples, &settings(threads, 1), None, |_| {}), "{threads} threads");
     }
-    assert_ne!(one, fit_explicit(&examples, &settings(1, 2), |_| {}));
+    assert_ne!(one, fit_explicit(&examples, &settings(1, 2), None, |_| {}));
 }
 
 #[cfg(feature = "infer")]

@@ -3,7 +3,7 @@
 
 mod learn_common;
 
-use gakp::learn::{Batch, Examples, Fit, LinkModel, Tape, fit, literal, logits, metrics};
+use gakp::learn::{Batch, Checkpoint, Examples, Fit, LinkModel, Split, Tape, fit, literal, logits, metrics};
 use learn_common::{examples, model};
 
 /// Weighted cross-entropy by the literal loop in f64.
@@ -59,7 +59,7 @@ fn learns_what_only_the_first_observation_tells() {
     let (seen, unseen) = (examples(400, &mut rng), examples(50, &mut rng));
     let settings = Fit { hidden: 12, epochs: 12, batch: 64, rate: 0.01, ..Fit::default() };
     let mut losses = vec![];
-    let model = fit(&seen, &settings, |p| losses.push(p.loss));
+    let (model, _) = fit(&seen.into(), &settings, None, |p| losses.push(p.loss));
     let found = metrics::scores(&logits(&model, &unseen), unseen.labels(), unseen.weights());
     assert!(found.auc > 0.95, "area under the curve on unseen examples: {}", found.auc);
     let mean = |part: &[f64]| part.iter().sum::<f64>() / part.len() as f64;
@@ -71,11 +71,54 @@ fn learns_what_only_the_first_observation_tells() {
 fn the_same_bits_for_any_number_of_threads_and_others_for_another_seed() {
     let mut rng = fastrand::Rng::with_seed(5);
     // A number of examples that leaves a last batch smaller than the number of shards.
-    let examples = examples(8, &mut rng);
+    let examples = Split::from(examples(8, &mut rng));
     let settings = |threads, seed| Fit { hidden: 8, epochs: 2, batch: 159, threads, seed, ..Fit::default() };
-    let one = fit(&examples, &settings(1, 1), |_| {});
+    let (one, _) = fit(&examples, &settings(1, 1), None, |_| {});
     for threads in 2..=5 {
-        assert_eq!(one, fit(&examples, &settings(threads, 1), |_| {}), "{threads} threads");
+        assert_eq!(one, fit(&examples, &settings(threads, 1), None, |_| {}).0, "{threads} threads");
     }
-    assert_ne!(one.gru, fit(&examples, &settings(1, 2), |_| {}).gru);
+    assert_ne!(one.gru, fit(&examples, &settings(1, 2), None, |_| {}).0.gru);
+}
+
+#[test]
+fn an_interrupted_fit_goes_on_to_the_same_bits() {
+    let mut rng = fastrand::Rng::with_seed(11);
+    let examples = Split { training: examples(30, &mut rng), validation: examples(5, &mut rng) };
+    let settings = Fit { hidden: 8, epochs: 5, batch: 64, patience: 0, ..Fit::default() };
+    let mut states: Vec<Checkpoint> = vec![];
+    let (whole, losses) = fit(&examples, &settings, None, |p| states.extend(p.checkpoint.cloned()));
+    assert_eq!((losses.len(), states.len()), (5, 5));
+    for state in states {
+        let text = serde_json::to_string(&state).expect("JSON");
+        let done = state.epochs.len();
+        let read = serde_json::from_str(&text).expect("a checkpoint");
+        let mut steps = vec![];
+        let (resumed, again) = fit(&examples, &settings, Some(read), |p| steps.push(p.step));
+        assert_eq!((resumed, again), (whole.clone(), losses.clone()), "after epoch {done}");
+        assert_eq!(steps.len(), examples.training.len().div_ceil(64) * (5 - done));
+    }
+}
+
+#[test]
+fn stops_where_validation_does_and_keeps_the_best_epoch() {
+    let mut rng = fastrand::Rng::with_seed(13);
+    // Few examples for many parameters: it learns them by heart, which helps nobody else.
+    let examples = Split { training: examples(2, &mut rng), validation: examples(20, &mut rng) };
+    let settings = Fit { hidden: 32, epochs: 60, batch: 8, rate: 0.03, patience: 3, ..Fit::default() };
+    let mut states: Vec<Checkpoint> = vec![];
+    let (_, losses) = fit(&examples, &settings, None, |p| states.extend(p.checkpoint.cloned()));
+    assert!(losses.len() < 60, "{} epochs", losses.len());
+    let best = states.last().and_then(Checkpoint::best_epoch).expect("an epoch");
+    assert_eq!(best + 3, losses.len() - 1, "three epochs without a lower loss");
+    let at_best = Fit { epochs: 60, patience: 0, ..settings.clone() };
+    let (all, _) = fit(&examples, &at_best, None, |_| {});
+    let (stopped, _) = fit(&examples, &settings, None, |_| {});
+    let loss = |model: &LinkModel| {
+        let v = &examples.validation;
+        metrics::scores(&logits(model, v), v.labels(), v.weights()).loss
+    };
+    // Both keep their best epoch; going on may at most find a better one.
+    assert!(loss(&all) <= loss(&stopped) + 1e-6, "{} and {}", loss(&all), loss(&stopped));
+    let unchecked = Split::from(examples.training.clone());
+    assert!(loss(&fit(&unchecked, &at_best, None, |_| {}).0) > loss(&stopped), "the last epoch is worse");
 }

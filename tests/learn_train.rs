@@ -45,7 +45,7 @@ fn write_sequence(root: &Path, name: &str, pace: f64) {
 
 fn world() -> tempfile::TempDir {
     let root = tempfile::tempdir().expect("a folder");
-    for (name, pace) in [("MOT17-01-A", 0.05), ("MOT17-01-B", 0.05), ("MOT17-02-A", 0.07), ("walk", 0.06)] {
+    for (name, pace) in [("MOT17-01-A", 0.02), ("MOT17-01-B", 0.02), ("MOT17-02-A", 0.03), ("walk", 0.025)] {
         write_sequence(root.path(), name, pace);
     }
     root
@@ -80,6 +80,46 @@ fn trains_the_same_file_twice_and_says_what_it_held_out() {
     for found in &report.unseen {
         assert!(found.pairs > 100 && found.auc > 0.9 && found.idf1 > 50.0, "{found:?}");
     }
+}
+
+#[test]
+fn a_killed_run_is_resumed_to_the_same_file() {
+    let root = world();
+    let at = |name: &str| root.path().join(name).display().to_string();
+    let text = |out: &str, more: &str| {
+        let data = root.path().display();
+        format!("{data} --out {} --examples 4000 --epochs 25 --patience 0{more}", at(out))
+    };
+    train::run(args(&text("whole.onnx", ""))).expect("trained");
+
+    let mut child = std::process::Command::new(env!("CARGO_BIN_EXE_gakp"))
+        .arg("train")
+        .args(text("cut.onnx", "").split(' '))
+        .stdout(std::process::Stdio::null())
+        .spawn()
+        .expect("started");
+    let checkpoint = PathBuf::from(at("cut.onnx.checkpoint"));
+    while !checkpoint.exists() && child.try_wait().expect("a child").is_none() {
+        std::thread::sleep(std::time::Duration::from_millis(1));
+    }
+    child.kill().expect("killed");
+    child.wait().expect("ended");
+    assert!(!PathBuf::from(at("cut.onnx")).exists(), "it was cut before its end");
+
+    let other = train::run(args(&text("cut.onnx", " --resume --seed 2"))).expect_err("another seed");
+    assert!(other.to_string().contains("is of other data or settings"), "{other}");
+    let (svg, report) = (at("curves.svg"), at("curves.json"));
+    let more = format!(" --resume --plot {svg} --report {report}");
+    train::run(args(&text("cut.onnx", &more))).expect("resumed");
+    let read = |name: &str| fs::read(at(name)).expect("a file");
+    assert_eq!(read("cut.onnx"), read("whole.onnx"));
+    assert!(!checkpoint.exists(), "nothing is left to resume");
+    let report: train::Report = serde_json::from_slice(&read("curves.json")).expect("a report");
+    let (name, epochs) = &report.epochs[0];
+    assert_eq!((name.as_str(), epochs.len()), ("cut.onnx", 25));
+    assert!(epochs[24].training < epochs[0].training && epochs[24].validation.is_some(), "{epochs:?}");
+    let drawn = fs::read_to_string(svg).expect("a picture");
+    assert!(drawn.contains("validation") && drawn.contains("training"));
 }
 
 #[test]

@@ -11,13 +11,16 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use crate::chart::{Line, Panel, svg};
 use crate::learn::card::{Card, MOTCHALLENGE_LICENCE, Unseen};
 use crate::learn::dataset::{self, LabelledSequence};
 use crate::learn::network::{Network, Scorer};
-use crate::learn::{Boxes, Examples, Fit, HeadFit, Recipe, Teacher, fit_head, metrics};
+use crate::learn::{
+    Boxes, Checkpoint, Epoch, Examples, Fit, HeadFit, Recipe, Split, Teacher, fit_head, metrics,
+};
 use crate::mot::{Benchmark, Row, Sequence, SequenceInfo, evaluate, first_half_length, parse_truth, replay};
 use crate::track::{Association, ExistenceHead, FilterConfig, TrackerConfig};
-use crate::tuning::Tuning;
+use crate::tuning::{FilterTuning, Tuning};
 
 /// Trains the network that says how probable it is that a detection continues a track.
 ///
@@ -53,9 +56,20 @@ pub struct Args {
     /// Seed of everything random.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Passes over the examples.
+    /// Passes over the examples, at most.
     #[arg(long, default_value_t = Fit::default().epochs as u64, value_parser = clap::value_parser!(u64).range(1..=1000))]
     pub epochs: u64,
+    /// Stop after so many epochs without a lower loss on the validation pairs (the last of every sequence);
+    /// 0 never does. The network of the best epoch is kept either way.
+    #[arg(long, value_name = "EPOCHS", default_value_t = Fit::default().patience as u64)]
+    pub patience: u64,
+    /// Go on where an interrupted run of the same data and settings stopped. After every epoch a run leaves
+    /// its state in OUT.checkpoint, and takes it away at its end.
+    #[arg(long)]
+    pub resume: bool,
+    /// Draw the losses of the epochs into this SVG.
+    #[arg(long, value_name = "FILE")]
+    pub plot: Option<PathBuf>,
     /// Width of the hidden state.
     #[arg(long, default_value_t = Fit::default().hidden as u64, value_parser = clap::value_parser!(u64).range(1..=1024))]
     pub hidden: u64,
@@ -68,7 +82,7 @@ pub struct Args {
     /// Threads; they do not change the result.
     #[arg(long, value_name = "N")]
     pub threads: Option<usize>,
-    /// Write the scores on held-out sequences as JSON.
+    /// Write the losses of the epochs and the scores on held-out sequences as JSON.
     #[arg(long, value_name = "FILE")]
     pub report: Option<PathBuf>,
     /// A report of a --loso run: its scores go into the model card.
@@ -76,11 +90,28 @@ pub struct Args {
     pub unseen: Option<PathBuf>,
 }
 
-/// Scores on held-out sequences.
+/// What came of the training.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Report {
-    /// One entry a sequence.
+    /// One entry a network: its file's name and its epochs.
+    #[serde(default)]
+    pub epochs: Vec<(String, Vec<Epoch>)>,
+    /// One entry a held-out sequence.
     pub unseen: Vec<Unseen>,
+}
+
+impl Report {
+    fn add(&mut self, trained: Trained) {
+        self.epochs.push((trained.name, trained.epochs));
+        self.unseen.extend(trained.unseen);
+    }
+}
+
+/// One network's part of the report.
+struct Trained {
+    name: String,
+    epochs: Vec<Epoch>,
+    unseen: Vec<Unseen>,
 }
 
 /// A sequence and where its files are.
@@ -95,13 +126,16 @@ struct Source {
 /// Data that cannot be read or is wrong, names that match nothing, and files that cannot be written.
 pub fn run(args: Args) -> Result<()> {
     let sources = load(&args.roots)?;
-    let mut report = match &args.unseen {
+    let known = match &args.unseen {
         Some(path) => {
             let text = fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
-            serde_json::from_str(&text).with_context(|| format!("{} is no report", path.display()))?
+            let report: Report =
+                serde_json::from_str(&text).with_context(|| format!("{} is no report", path.display()))?;
+            report.unseen
         }
-        None => Report::default(),
+        None => vec![],
     };
+    let mut report = Report { epochs: vec![], unseen: known.clone() };
     if let Some(name) = &args.loso {
         let mut groups: Vec<&str> = sources.iter().map(|s| s.labelled.group.as_str()).collect();
         groups.retain(|g| g.contains(name.as_str()));
@@ -110,7 +144,7 @@ pub fn run(args: Args) -> Result<()> {
         fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
         for group in groups {
             let out = args.out.join(format!("{group}.onnx"));
-            report.unseen.extend(train(&args, &sources, &|s| s.group == group, &out, &[])?);
+            report.add(train(&args, &sources, &|s| s.group == group, &out, &[])?);
         }
     } else {
         let excluded = |s: &LabelledSequence| {
@@ -124,8 +158,10 @@ pub fn run(args: Args) -> Result<()> {
         let groups: Vec<String> =
             sources.iter().map(|s| &s.labelled).filter(|s| excluded(s)).map(|s| s.group.clone()).collect();
         let out = args.out.clone();
-        let found = train(&args, &sources, &|s| groups.contains(&s.group), &out, &report.unseen)?;
-        report.unseen.extend(found);
+        report.add(train(&args, &sources, &|s| groups.contains(&s.group), &out, &known)?);
+    }
+    if let Some(path) = &args.plot {
+        write(path, curves(&report.epochs)?.as_bytes())?;
     }
     if let Some(path) = &args.report {
         write(path, (serde_json::to_string_pretty(&report)? + "\n").as_bytes())?;
@@ -157,26 +193,29 @@ fn train(
     held_out: &dyn Fn(&LabelledSequence) -> bool,
     out: &Path,
     known: &[Unseen],
-) -> Result<Vec<Unseen>> {
+) -> Result<Trained> {
     let (held, seen): (Vec<&Source>, Vec<&Source>) = sources.iter().partition(|s| held_out(&s.labelled));
     ensure!(!seen.is_empty(), "nothing to train on: every sequence is held out");
     let name = out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    let tracker = TrackerConfig { filter: filter(args, out)?, ..TrackerConfig::default() };
+    let (filter, filter_of) = filter(args, out)?;
+    let tracker = TrackerConfig { filter, ..TrackerConfig::default() };
     let teacher = Teacher { filter: tracker.filter, ..Teacher::default() };
     let recipe = Recipe { teacher, examples: args.examples as usize, seed: args.seed, ..Recipe::default() };
     let examples = collect(&recipe, &seen, &name);
     ensure!(
-        !examples.is_empty(),
+        !examples.training.is_empty(),
         "no pair in the training sequences: are there detections that overlap truth?"
     );
     let settings = Fit {
         hidden: args.hidden as usize,
         epochs: args.epochs as usize,
         seed: args.seed,
+        patience: args.patience as usize,
         threads: args.threads.or_else(|| thread::available_parallelism().ok().map(usize::from)).unwrap_or(1),
         ..Fit::default()
     };
-    let model = run_fit(args.association.parse()?, &settings, &examples, &name);
+    let mut checkpoint = CheckpointFile::open(args, out, &settings, &examples)?;
+    let (model, epochs) = run_fit(args.association.parse()?, &settings, &examples, &name, &mut checkpoint);
     let boxes = boxes(&model, &tracker, &seen, &args.second_half, &name)?;
     ensure!(!boxes.is_empty(), "the tracker confirms no track in the training sequences");
     let head_fit = HeadFit { seed: args.seed, ..HeadFit::default() };
@@ -209,14 +248,15 @@ fn train(
         parameters: model.parameters(),
         sequences: names(&seen),
         excluded: names(&held),
-        examples: (examples.len(), examples.positive_share()),
+        examples: (examples.training.len(), examples.training.positive_share()),
         boxes: (boxes.len(), boxes.positive_share()),
-        settings: describe(&settings, &recipe),
+        settings: describe(&settings, &recipe, (&tracker.filter, filter_of)),
         unseen: known.iter().chain(&scores).cloned().collect(),
     };
     let mut metadata: BTreeMap<String, String> = card.settings.iter().cloned().collect();
     metadata.insert("licence".into(), args.licence.clone());
     metadata.insert("existence".into(), head.to_string());
+    metadata.insert("filter".into(), FilterTuning::of(&tracker.filter).to_toml()?);
     metadata.insert("sequences".into(), card.sequences.join(" "));
     metadata.insert("excluded".into(), card.excluded.join(" "));
     if card.explicit {
@@ -227,19 +267,95 @@ fn train(
     write(out, &bytes)?;
     write(&out.with_extension("md"), card.markdown().as_bytes())?;
     write(&out.with_extension("toml"), manifest(out, &bytes, &args.licence, model.family())?.as_bytes())?;
-    println!("wrote {} ({} examples)", out.display(), examples.len());
-    Ok(scores)
+    checkpoint.remove();
+    println!("wrote {} ({} examples)", out.display(), examples.training.len());
+    Ok(Trained { name: card.file, epochs, unseen: scores })
 }
 
-/// The filter that the network in `out` is for.
-fn filter(args: &Args, out: &Path) -> Result<FilterConfig> {
+/// Where a run leaves its state after every epoch.
+struct CheckpointFile {
+    path: PathBuf,
+    /// What the state belongs to: settings and examples.
+    fingerprint: String,
+    /// State to go on from.
+    found: Option<Checkpoint>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Saved {
+    fingerprint: String,
+    state: Checkpoint,
+}
+
+impl CheckpointFile {
+    fn open(args: &Args, out: &Path, fit: &Fit, examples: &Split) -> Result<Self> {
+        let path = out.with_added_extension("checkpoint");
+        // The number of threads does not change the result.
+        let settings = Fit { threads: 1, ..fit.clone() };
+        let digest: String = examples.fingerprint().iter().map(|byte| format!("{byte:02x}")).collect();
+        let fingerprint = format!("{} {settings:?} {digest}", args.association);
+        let mut found = None;
+        if args.resume && path.is_file() {
+            let text =
+                fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
+            let saved: Saved = serde_json::from_str(&text)
+                .with_context(|| format!("{} is no checkpoint: delete it to begin anew", path.display()))?;
+            ensure!(
+                saved.fingerprint == fingerprint,
+                "{} is of other data or settings: give the same as then, or leave --resume out to begin anew",
+                path.display()
+            );
+            println!("{}: going on after epoch {}", path.display(), saved.state.epochs.len());
+            found = Some(saved.state);
+        }
+        Ok(Self { path, fingerprint, found })
+    }
+
+    /// Written beside its place first: an interrupted write leaves the last state.
+    fn save(&self, state: &Checkpoint) -> Result<()> {
+        let saved = Saved { fingerprint: self.fingerprint.clone(), state: state.clone() };
+        let new = self.path.with_added_extension("new");
+        write(&new, serde_json::to_string(&saved)?.as_bytes())?;
+        fs::rename(&new, &self.path).with_context(|| format!("cannot write {}", self.path.display()))
+    }
+
+    fn remove(self) {
+        // Of no use any more; a later run without --resume does not look at it.
+        let _ = fs::remove_file(&self.path);
+    }
+}
+
+/// Losses by epoch, a panel for each network.
+fn curves(networks: &[(String, Vec<Epoch>)]) -> Result<String> {
+    let panel = |(name, epochs): &(String, Vec<Epoch>)| {
+        let line = |name: &str, of: &dyn Fn(&Epoch) -> Option<f64>| {
+            let points =
+                epochs.iter().enumerate().filter_map(|(i, epoch)| Some((i as f64 + 1.0, of(epoch)?)));
+            Line::new(name, points.collect())
+        };
+        Panel {
+            caption: name.clone(),
+            axes: ["epoch".into(), "weighted cross-entropy, nats".into()],
+            log: false,
+            lines: vec![line("training", &|e| Some(e.training)), line("validation", &|e| e.validation)],
+        }
+    };
+    Ok(svg(&networks.iter().map(panel).collect::<Vec<_>>(), networks.len().clamp(1, 2))?)
+}
+
+/// The filter that the network in `out` is for, and what it was tuned on.
+fn filter(args: &Args, out: &Path) -> Result<(FilterConfig, String)> {
     let default = FilterConfig::default();
-    let Some(file) = &args.tuning else { return Ok(default) };
+    let Some(file) = &args.tuning else {
+        return Ok((default, format!("the program's own, {}", FilterConfig::TUNED_ON)));
+    };
     let file = match &args.loso {
         Some(_) => file.join(out.with_extension("toml").file_name().unwrap_or_default()),
         None => file.clone(),
     };
-    Ok(Tuning::read(&file)?.filter.apply(default))
+    let tuning = Tuning::read(&file)?;
+    let data = tuning.origin.map_or_else(|| "unknown data".into(), |origin| origin.data.join(", "));
+    Ok((tuning.filter.apply(default), format!("a tuning file, of {data}")))
 }
 
 /// A manifest of this one network, so that `--link OUT.onnx` takes it.
@@ -266,7 +382,7 @@ fn manifest(out: &Path, bytes: &[u8], licence: &str, family: &str) -> Result<Str
     Ok(toml::to_string(&BTreeMap::from([("model", [entry])]))?)
 }
 
-fn collect(recipe: &Recipe, seen: &[&Source], name: &str) -> Examples {
+fn collect(recipe: &Recipe, seen: &[&Source], name: &str) -> Split {
     let sequences: Vec<&LabelledSequence> = seen.iter().map(|s| &s.labelled).collect();
     let bar = bar((sequences.len() * recipe.variants.len()) as u64, "{msg} {wide_bar} {pos}/{len}");
     bar.set_message(format!("{name}: examples"));
@@ -275,18 +391,33 @@ fn collect(recipe: &Recipe, seen: &[&Source], name: &str) -> Examples {
     examples
 }
 
-fn run_fit(association: Association, settings: &Fit, examples: &Examples, name: &str) -> Network {
+fn run_fit(
+    association: Association,
+    settings: &Fit,
+    examples: &Split,
+    name: &str,
+    checkpoint: &mut CheckpointFile,
+) -> (Network, Vec<Epoch>) {
     let mut mean = f64::NAN;
     let bar = bar(0, "{msg} {wide_bar} {pos}/{len} {eta}");
-    let model = Network::fit(association, examples, settings, |p| {
+    let from = checkpoint.found.take();
+    let (model, epochs) = Network::fit(association, examples, settings, from, |p| {
         bar.set_length(p.steps as u64);
         mean = if mean.is_nan() { p.loss } else { mean + 0.02 * (p.loss - mean) };
         bar.set_message(format!("{name}: cross-entropy {mean:.4}"));
         bar.set_position(p.step as u64);
+        if let Some(state) = p.checkpoint
+            && let Err(error) = checkpoint.save(state)
+        {
+            tracing::warn!("this run cannot be resumed: {error:#}");
+        }
     });
     bar.finish_and_clear();
-    println!("{name}: cross-entropy of the last batches {mean:.4}");
-    model
+    for (i, Epoch { training, validation }) in epochs.iter().enumerate() {
+        let validation = validation.map_or("none".into(), |loss| format!("{loss:.4}"));
+        println!("{name}: epoch {}, cross-entropy {training:.4}, on validation pairs {validation}", i + 1);
+    }
+    (model, epochs)
 }
 
 /// A bar on a terminal, nothing elsewhere.
@@ -390,11 +521,23 @@ fn score(
     })
 }
 
-fn describe(fit: &Fit, recipe: &Recipe) -> Vec<(String, String)> {
+fn describe(
+    fit: &Fit,
+    recipe: &Recipe,
+    (filter, filter_of): (&FilterConfig, String),
+) -> Vec<(String, String)> {
     let Recipe { teacher, variants, seed, .. } = recipe;
+    let of = |values: [f64; 3]| values.map(|v| v.to_string()).join(" / ");
     let rows = [
+        ("filter", filter_of),
+        (
+            "acceleration / walk / measurement of the centre",
+            of([filter.centre_acceleration, filter.centre_walk, filter.centre_measurement]),
+        ),
+        ("of the size", of([filter.size_acceleration, filter.size_walk, filter.size_measurement])),
         ("seed", seed.to_string()),
-        ("epochs", fit.epochs.to_string()),
+        ("epochs", format!("{} at most, the one of least validation loss", fit.epochs)),
+        ("validation pairs", format!("{} % of all, the last of every sequence", 100.0 * recipe.validation)),
         ("batch", fit.batch.to_string()),
         ("optimiser", format!("Adam, peak {}, warm-up {}, cosine to 0", fit.rate, fit.warm_up)),
         ("copies of a sequence", variants.len().to_string()),

@@ -159,7 +159,7 @@ fn on_recordings(
     out: &Path,
     svg: Option<&Path>,
 ) -> Result<()> {
-    let start = FilterConfig::default();
+    let start = FilterConfig::hand_set();
     let tuned = with_bar(&start, seen, settings, name)?;
     let Settings { statistic, trim, .. } = *settings;
     let on = |filter: &FilterConfig, recordings: &[&Recording]| measure(filter, recordings, statistic);

@@ -13,8 +13,8 @@ use crate::types::{BBox, Embedding, Image};
 pub const CALIBRATION: Calibration = Calibration {
     high_score: None,
     birth_score: None,
-    appearance_weight: Some(10.0),
-    appearance_pivot: Some(0.75),
+    appearance_weight: Some(20.0),
+    appearance_pivot: Some(0.8),
 };
 
 /// Stripes from top to bottom.

@@ -133,9 +133,8 @@ impl LinkAlone {
     }
 
     /// As [`super::Linker::calibrate`].
-    pub fn calibrate(&self, mut tracker: TrackerConfig) -> TrackerConfig {
-        tracker.existence.head = self.0.existence.clone();
-        tracker
+    pub fn calibrate(&self, tracker: TrackerConfig) -> TrackerConfig {
+        self.0.surroundings.calibrate(tracker)
     }
 
     /// As [`super::Linker::score`].

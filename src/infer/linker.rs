@@ -2,7 +2,8 @@
 //!
 //! The graph takes `histories` f32 `[T, 6, 14]`, `lengths` i32 `[T]`, `candidates` f32 `[P, 20]` and
 //! `pair_track` i64 `[P]` (which history a candidate belongs to) and gives `probability` f32 `[P]`.
-//! The file's metadata may hold an [`ExistenceHead`], trained on what the tracker makes of these very
+//! The file's metadata may hold what belongs to the network: the filter that it was trained with, as `filter`
+//! (the table of a tuning file), and an [`ExistenceHead`], trained on what the tracker makes of these very
 //! probabilities, as `existence`.
 //!
 //! Requests of several cameras are joined by concatenation; `pair_track` moves by the tracks before it.
@@ -21,6 +22,7 @@ use super::{Arrangement, BatchModel, Batcher, InferError, Observer, Task};
 use crate::track::{
     Association, CANDIDATE_FEATURES, ExistenceHead, HISTORY, LinkRequest, STEP_FEATURES, TrackerConfig,
 };
+use crate::tuning::FilterTuning;
 
 const MODEL: &str = Task::Link.as_str();
 const INPUTS: [(&str, TensorElementType); 4] = [
@@ -32,12 +34,40 @@ const INPUTS: [(&str, TensorElementType); 4] = [
 const OUTPUT: &str = "probability";
 /// Metadata that holds the existence head.
 const EXISTENCE: &str = "existence";
+/// Metadata that holds the filter.
+const FILTER: &str = "filter";
+
+/// What a network's file says of the tracker around it.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Surroundings {
+    existence: Option<Arc<ExistenceHead>>,
+    filter: FilterTuning,
+}
+
+impl Surroundings {
+    fn read(session: &Session) -> Result<Self, String> {
+        let metadata = session.metadata().map_err(|e| format!("its metadata cannot be read: {e}"))?;
+        let existence = metadata.custom(EXISTENCE).map(|text| text.parse()).transpose();
+        let filter = metadata.custom(FILTER).map(|text| FilterTuning::parse(&text)).transpose();
+        Ok(Self {
+            existence: existence.map_err(|e| format!("its existence head is broken: {e}"))?.map(Arc::new),
+            filter: filter.map_err(|e| format!("its filter is broken: {e}"))?.unwrap_or_default(),
+        })
+    }
+
+    /// `tracker` with the network's filter and existence head, where it has them.
+    pub(super) fn calibrate(&self, mut tracker: TrackerConfig) -> TrackerConfig {
+        tracker.filter = self.filter.apply(tracker.filter);
+        tracker.existence.head = self.existence.clone();
+        tracker
+    }
+}
 
 /// Scores link requests. Clones share the model.
 #[derive(Clone)]
 pub struct Linker {
     batcher: Arc<Batcher<LinkModel>>,
-    existence: Option<Arc<ExistenceHead>>,
+    surroundings: Surroundings,
     name: Arc<str>,
     family: Family,
 }
@@ -52,11 +82,11 @@ impl Linker {
         observer: Arc<dyn Observer>,
     ) -> Result<Self, InferError> {
         let (runtime, name, file) = (runtime.clone(), entry.name.clone(), file.to_path_buf());
-        let existence = Arc::new(OnceLock::new());
-        let found = existence.clone();
+        let surroundings = Arc::new(OnceLock::new());
+        let found = surroundings.clone();
         let batcher = Batcher::start(MODEL, arrangement, observer, move |_| {
             let mut model = LinkModel::load(&runtime, &name, &file)?;
-            found.get_or_init(|| model.existence.take());
+            found.get_or_init(|| model.surroundings.clone());
             model.run(&[warm_up()])?;
             Ok(model)
         })?;
@@ -64,14 +94,13 @@ impl Linker {
             batcher: Arc::new(batcher),
             name: entry.name.as_str().into(),
             family: entry.family,
-            existence: existence.get().cloned().flatten(),
+            surroundings: surroundings.get().cloned().unwrap_or_default(),
         })
     }
 
-    /// `tracker` with the existence head that the model's file carries, if it does.
-    pub fn calibrate(&self, mut tracker: TrackerConfig) -> TrackerConfig {
-        tracker.existence.head = self.existence.clone();
-        tracker
+    /// `tracker` with the filter and the existence head that the model's file carries, if it does.
+    pub fn calibrate(&self, tracker: TrackerConfig) -> TrackerConfig {
+        self.surroundings.calibrate(tracker)
     }
 
     /// Whether its probabilities are those that `association` is named after.
@@ -151,7 +180,7 @@ fn warm_up() -> LinkRequest {
 /// One instance of the link scorer.
 pub(super) struct LinkModel {
     session: Session,
-    pub(super) existence: Option<Arc<ExistenceHead>>,
+    pub(super) surroundings: Surroundings,
     /// The joined request of a batch.
     joined: LinkRequest,
     pair_track: Vec<i64>,
@@ -177,15 +206,10 @@ impl LinkModel {
         let outlet = session.outputs().iter().find(|outlet| outlet.name() == OUTPUT);
         let outlet = outlet.ok_or_else(|| wrong(format!("it has no output {OUTPUT:?}")))?;
         check_type("output", outlet, TensorElementType::Float32).map_err(wrong)?;
-        let metadata = session.metadata().map_err(|e| wrong(format!("its metadata cannot be read: {e}")))?;
-        let existence = metadata.custom(EXISTENCE);
-        drop(metadata);
-        let existence = existence.map(|text| text.parse()).transpose();
-        let existence =
-            existence.map_err(|e| wrong(format!("its existence head is broken: {e}")))?.map(Arc::new);
+        let surroundings = Surroundings::read(&session).map_err(wrong)?;
         Ok(Self {
             session,
-            existence,
+            surroundings,
             joined: LinkRequest::default(),
             pair_track: vec![],
             last: Duration::ZERO,

@@ -1,5 +1,7 @@
 //! Adam (Kingma and Ba 2015) and its learning-rate schedule.
 
+use serde::{Deserialize, Serialize};
+
 /// Warm-up, then half a cosine down to zero.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Schedule {
@@ -23,7 +25,7 @@ impl Schedule {
 }
 
 /// Running moments of every parameter.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Adam {
     mean: Vec<f32>,
     square: Vec<f32>,

@@ -1,5 +1,9 @@
 //! Labelled pairs, in columns: link requests joined to the truth.
 
+use std::ops::Range;
+
+use sha2::{Digest, Sha256};
+
 use crate::track::{CANDIDATE_FEATURES, HISTORY, LinkRequest, STEP_FEATURES};
 
 /// A growing set of labelled pairs with raw features.
@@ -13,6 +17,40 @@ pub struct Examples {
     track: Vec<u32>,
     labels: Vec<f32>,
     weights: Vec<f32>,
+}
+
+/// Examples to learn from, and others to tell by when to stop.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Split {
+    /// To learn from.
+    pub training: Examples,
+    /// Never learned from; may be empty.
+    pub validation: Examples,
+}
+
+impl From<Examples> for Split {
+    /// All to learn from.
+    fn from(training: Examples) -> Self {
+        Self { training, validation: Examples::default() }
+    }
+}
+
+impl Split {
+    /// A SHA-256 of all that is in it.
+    pub fn fingerprint(&self) -> [u8; 32] {
+        let mut hash = Sha256::new();
+        for Examples { histories, lengths, candidates, track, labels, weights } in
+            [&self.training, &self.validation]
+        {
+            for values in [histories, candidates, labels, weights] {
+                hash.update((values.len() as u64).to_le_bytes());
+                values.iter().for_each(|v| hash.update(v.to_le_bytes()));
+            }
+            hash.update(lengths);
+            track.iter().for_each(|t| hash.update(t.to_le_bytes()));
+        }
+        hash.finalize().into()
+    }
 }
 
 impl Examples {
@@ -63,14 +101,17 @@ impl Examples {
         self.weights.extend_from_slice(&other.weights);
     }
 
-    /// A random choice of `count` examples, in their order; all of them when there are fewer.
-    pub fn choose(&self, count: usize, rng: &mut fastrand::Rng) -> Examples {
+    /// A random choice of `count` of the examples in `range`, in their order; all of them when there are fewer.
+    ///
+    /// # Panics
+    /// When `range` is beyond the examples.
+    pub fn choose(&self, range: Range<usize>, count: usize, rng: &mut fastrand::Rng) -> Examples {
         let mut chosen = Examples::default();
         let mut moved: Vec<Option<u32>> = vec![None; self.lengths.len()];
-        let mut wanted = count.min(self.len());
-        for i in 0..self.len() {
+        let mut wanted = count.min(range.len());
+        for i in range.clone() {
             // Knuth's selection sampling: the share still wanted of those still to come.
-            if rng.usize(..self.len() - i) >= wanted {
+            if rng.usize(..range.end - i) >= wanted {
                 continue;
             }
             wanted -= 1;

@@ -29,10 +29,10 @@ mod teacher;
 pub mod tune;
 
 pub use adam::{Adam, Schedule};
-pub use examples::Examples;
+pub use examples::{Examples, Split};
 pub use existence::{Boxes, HeadFit, fit_head};
 pub use explicit::{ExplicitModel, ExplicitScorer, ExplicitShape, fit_explicit, logits_explicit};
-pub use fit::{Fit, Progress, fit, logits};
+pub use fit::{Checkpoint, Epoch, Fit, Progress, fit, logits};
 pub use gru::{Batch, Gru, GruShape, Tape};
 pub use model::{LinkModel, Normaliser};
 pub use recipe::Recipe;

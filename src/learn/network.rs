@@ -4,8 +4,8 @@
 use std::collections::BTreeMap;
 
 use super::{
-    Examples, ExplicitModel, ExplicitScorer, Fit, GruScorer, LinkModel, Progress, fit, fit_explicit, logits,
-    logits_explicit, onnx,
+    Checkpoint, Epoch, Examples, ExplicitModel, ExplicitScorer, Fit, GruScorer, LinkModel, Progress, Split,
+    fit, fit_explicit, logits, logits_explicit, onnx,
 };
 use crate::track::{Association, LinkRequest};
 
@@ -23,13 +23,20 @@ impl Network {
     /// implicit one. See [`fit()`].
     pub fn fit(
         association: Association,
-        examples: &Examples,
+        examples: &Split,
         settings: &Fit,
-        tell: impl FnMut(Progress),
-    ) -> Self {
+        from: Option<Checkpoint>,
+        tell: impl FnMut(Progress<'_>),
+    ) -> (Self, Vec<Epoch>) {
         match association {
-            Association::Explicit => Network::Explicit(fit_explicit(examples, settings, tell)),
-            _ => Network::Implicit(fit(examples, settings, tell)),
+            Association::Explicit => {
+                let (model, epochs) = fit_explicit(examples, settings, from, tell);
+                (Network::Explicit(model), epochs)
+            }
+            _ => {
+                let (model, epochs) = fit(examples, settings, from, tell);
+                (Network::Implicit(model), epochs)
+            }
         }
     }
 

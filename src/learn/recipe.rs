@@ -1,7 +1,7 @@
 //! What a network is trained on: sequences, their changed copies, how many pairs of each.
 
 use super::dataset::{LabelledSequence, Variant, vary};
-use super::examples::Examples;
+use super::examples::{Examples, Split};
 use super::teacher::Teacher;
 
 /// How examples are made of sequences.
@@ -14,6 +14,8 @@ pub struct Recipe {
     /// Examples wanted. Every copy of every sequence gives an equal part, so that a crowded one does
     /// not outvote the others; a short one may have fewer.
     pub examples: usize,
+    /// Share of them to validate on: those of the last part of every sequence.
+    pub validation: f64,
     /// Seed of all that is random here.
     pub seed: u64,
 }
@@ -30,6 +32,7 @@ impl Default for Recipe {
                 copy(true, 3, 0.0, 0.05),
             ],
             examples: 150_000,
+            validation: 0.05,
             seed: 1,
         }
     }
@@ -37,16 +40,21 @@ impl Default for Recipe {
 
 impl Recipe {
     /// Makes the examples; `tell` hears of every copy that is done.
-    pub fn collect(&self, sequences: &[&LabelledSequence], mut tell: impl FnMut()) -> Examples {
+    pub fn collect(&self, sequences: &[&LabelledSequence], mut tell: impl FnMut()) -> Split {
         let mut rng = fastrand::Rng::with_seed(self.seed);
-        let mut all = Examples::default();
+        let mut all = Split::default();
         let copies = (sequences.len() * self.variants.len()).max(1);
+        let wanted = self.examples.div_ceil(copies);
+        let later = (wanted as f64 * self.validation).round() as usize;
         for sequence in sequences {
             for variant in &self.variants {
                 let copy = vary(sequence, variant, &mut rng);
                 let mut found = Examples::default();
                 self.teacher.collect(&copy, &mut rng, &mut found);
-                all.append(&found.choose(self.examples.div_ceil(copies), &mut rng));
+                // Examples lie in the order of their frames.
+                let end = found.len() - (found.len() as f64 * self.validation).round() as usize;
+                all.training.append(&found.choose(0..end, wanted - later, &mut rng));
+                all.validation.append(&found.choose(end..found.len(), later, &mut rng));
                 tell();
             }
         }

@@ -2,15 +2,27 @@
 //!
 //! A camera that pans moves every person alike. Confident tracks are matched to detections by
 //! overlap alone, and the median displacement moves all tracks, the lost ones too, before anything
-//! else is decided.
+//! else is decided. How much the displacements differ says how far the median may be off.
+
+use std::f64::consts::FRAC_PI_2;
 
 use super::ShiftConfig;
 use super::association::match_pairs;
 use super::nearby::Nearby;
 use crate::types::BBox;
 
-/// The shift `(dx, dy)` in pixels from `predicted` boxes to `detections`; `None` when too few agree.
-pub fn global_shift(config: &ShiftConfig, predicted: &[BBox], detections: &Nearby) -> Option<(f64, f64)> {
+/// The camera's motion between two frames.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Shift {
+    /// `(dx, dy)`, pixels.
+    pub by: [f64; 2],
+    /// Variance of each, pixels^2: that of the median of `n` displacements whose standard deviation is `s`,
+    /// `pi s^2 / (2 n)`, and the square of what the shrinkage holds back.
+    pub variance: [f64; 2],
+}
+
+/// The shift from `predicted` boxes to `detections`; `None` when too few agree.
+pub fn global_shift(config: &ShiftConfig, predicted: &[BBox], detections: &Nearby) -> Option<Shift> {
     if !config.enabled || predicted.len() < config.min_pairs || detections.len() < config.min_pairs {
         return None;
     }
@@ -34,7 +46,15 @@ pub fn global_shift(config: &ShiftConfig, predicted: &[BBox], detections: &Nearb
         return None;
     }
     let weight = n as f64 / (n as f64 + config.shrink);
-    Some((median(&mut dx) * weight, median(&mut dy) * weight))
+    let of = |values: &mut [f64]| {
+        let middle = median(values);
+        let mut off: Vec<f64> = values.iter().map(|v| (v - middle).abs()).collect();
+        let spread = 1.4826 * median(&mut off);
+        let variance = FRAC_PI_2 * spread * spread / n as f64 + ((1.0 - weight) * middle).powi(2);
+        (middle * weight, variance)
+    };
+    let ((dx, var_x), (dy, var_y)) = (of(&mut dx), of(&mut dy));
+    Some(Shift { by: [dx, dy], variance: [var_x, var_y] })
 }
 
 /// Median of a non-empty slice, which it reorders.
@@ -62,8 +82,20 @@ mod tests {
     fn finds_a_pan_and_ignores_one_runner() {
         let mut moved = people(8.0);
         moved[2] = moved[2].shifted(12.0, 0.0);
-        let (dx, dy) = global_shift(&ShiftConfig::default(), &people(0.0), &nearby(&moved)).unwrap();
+        let Shift { by: [dx, dy], variance } =
+            global_shift(&ShiftConfig::default(), &people(0.0), &nearby(&moved)).unwrap();
         assert!((dx - 8.0 * 5.0 / 5.3).abs() < 1e-9 && dy == 0.0, "{dx} {dy}");
+        assert!((variance[0].sqrt() - 8.0 * 0.3 / 5.3).abs() < 1e-9 && variance[1] == 0.0, "{variance:?}");
+    }
+
+    #[test]
+    fn is_less_sure_the_more_people_disagree() {
+        let off = [-4.0, -2.0, 0.0, 2.0, 4.0];
+        let moved: Vec<BBox> = people(8.0).iter().zip(off).map(|(b, d)| b.shifted(d, 0.0)).collect();
+        let shift = global_shift(&ShiftConfig::default(), &people(0.0), &nearby(&moved)).unwrap();
+        // Median absolute deviation 2, standard deviation 1.4826 times that, of five.
+        let expected = FRAC_PI_2 * (1.4826f64 * 2.0).powi(2) / 5.0 + (8.0f64 * 0.3 / 5.3).powi(2);
+        assert!((shift.variance[0] - expected).abs() < 1e-9, "{shift:?}");
     }
 
     #[test]

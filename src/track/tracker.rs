@@ -284,9 +284,9 @@ impl Tracker {
             .filter(|t| t.matched && t.hits >= config.min_hits)
             .map(Tracklet::bbox)
             .collect();
-        if let Some((dx, dy)) = global_shift(config, &seen, &self.high) {
+        if let Some(shift) = global_shift(config, &seen, &self.high) {
             for track in &mut self.tracks {
-                track.shift(dx, dy);
+                track.shift(&shift);
             }
         }
     }

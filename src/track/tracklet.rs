@@ -6,6 +6,7 @@ use super::config::{FilterConfig, LifeConfig};
 use super::kalman::BoxFilter;
 use super::link::HISTORY;
 use super::motion::{Step, measurement_noise, newborn};
+use super::shift::Shift;
 use crate::types::{BBox, ClassId, Detection, Embedding, MediaTime, TrackId, TrackState};
 
 /// Where the running mean of innovations begins, heights.
@@ -143,10 +144,14 @@ impl Tracklet {
         }
     }
 
-    /// Moves everything that it knows by the camera's shift; velocities stay.
-    pub fn shift(&mut self, dx: f64, dy: f64) {
-        self.filter.axes[0].x[0] += dx;
-        self.filter.axes[1].x[0] += dy;
+    /// Moves everything that it knows by the camera's shift, and is as much less sure of its place as the
+    /// shift is unsure; velocities stay.
+    pub fn shift(&mut self, shift: &Shift) {
+        let Shift { by: [dx, dy], variance } = *shift;
+        for ((axis, d), variance) in self.filter.axes.iter_mut().zip([dx, dy]).zip(variance) {
+            axis.x[0] += d;
+            axis.P[(0, 0)] += variance;
+        }
         for seen in &mut self.history {
             seen.bbox = seen.bbox.shifted(dx, dy);
         }

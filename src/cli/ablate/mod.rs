@@ -62,14 +62,20 @@ pub struct Args {
 pub fn run(args: Args) -> Result<()> {
     let config = args.config.as_deref().map(Config::read).transpose()?.unwrap_or_default();
     let models = ModelConfig::from(args.models.clone()).or(config.models);
-    let base = config.tracker.apply(TrackerConfig::default())?;
     let worlds = world::load(&args.root, &args.det, &args.second_half)?;
-    let mut networks = Networks::new(&args, models, config.tracker.existence != Some(false))?;
-    let variants = variant::all(&base);
+    let mut networks = Networks::new(&args, models)?;
+    let variants = variant::all(&config.tracker.apply(TrackerConfig::default())?);
     let results = worlds
         .iter()
         .map(|world| {
             tracing::info!(sequence = world.name, "tracking");
+            // The same filter and the same decision on what is output for every row, so that only the
+            // association differs.
+            let mut base = TrackerConfig::default();
+            if let Some(linker) = networks.get(Association::Implicit, &world.footage)? {
+                base = linker.calibrate(base);
+            }
+            let variants = variant::all(&config.tracker.apply(base)?);
             variants.iter().map(|variant| measure(world, variant, &mut networks)).collect()
         })
         .collect::<Result<Vec<Vec<Cell>>>>()?;
@@ -95,12 +101,6 @@ fn measure(world: &World, variant: &Variant, networks: &mut Networks) -> Result<
         },
         false => None,
     };
-    // The same decision on what is output for every row, so that only the association differs.
-    let mut config = variant.config.clone();
-    if let Some(linker) = networks.get(Association::Implicit, &world.footage)?.filter(|_| networks.existence)
-    {
-        config = linker.calibrate(config);
-    }
     let embeddings = |frame: usize| match &world.embeddings {
         Some(embeddings) if variant.appearance => embeddings.frame(frame).to_vec(),
         _ => Vec::new(),
@@ -110,7 +110,7 @@ fn measure(world: &World, variant: &Variant, networks: &mut Networks) -> Result<
         None => Ok(Vec::new()),
     };
     let start = Instant::now();
-    let rows = replay(&world.sequence, &config, embeddings, links)?;
+    let rows = replay(&world.sequence, &variant.config, embeddings, links)?;
     let seconds = start.elapsed().as_secs_f64();
     let frames = world.sequence.info.length;
     let score = evaluate(&world.truth, &rows, frames, world.benchmark).with_context(|| world.name.clone())?;
@@ -123,13 +123,11 @@ struct Networks {
     /// Folder of one association's networks; one network for all footage otherwise.
     folders: [(Association, Option<PathBuf>); 2],
     single: bool,
-    /// Whether a network's existence head is used.
-    existence: bool,
     loaded: BTreeMap<(&'static str, String), Option<Linker>>,
 }
 
 impl Networks {
-    fn new(args: &Args, models: ModelConfig, existence: bool) -> Result<Self> {
+    fn new(args: &Args, models: ModelConfig) -> Result<Self> {
         let single = models.link.is_some();
         for folder in [&args.links, &args.explicit_links].into_iter().flatten() {
             ensure!(folder.is_dir(), "there is no folder {}", folder.display());
@@ -140,7 +138,7 @@ impl Networks {
             (Association::Implicit, args.links.clone()),
             (Association::Explicit, args.explicit_links.clone()),
         ];
-        Ok(Self { settings, folders, single, existence, loaded: BTreeMap::new() })
+        Ok(Self { settings, folders, single, loaded: BTreeMap::new() })
     }
 
     /// The network for `footage`, one that has not seen it; `None` when there is none.

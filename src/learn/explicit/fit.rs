@@ -1,8 +1,8 @@
 //! Fitting the network of explicit weights to examples.
 
 use super::super::descent::{Trainee, descend};
-use super::super::examples::Examples;
-use super::super::fit::{Fit, Progress};
+use super::super::examples::{Examples, Split};
+use super::super::fit::{Checkpoint, Epoch, Fit, Progress};
 use super::super::gru::cross_entropy;
 use super::{ExplicitModel, ExplicitShape, Run, backward, encode, logit, sigmoid};
 use crate::track::association::explicit::COSTS;
@@ -54,18 +54,22 @@ impl Trainee for ExplicitModel {
     }
 }
 
-/// Trains a network on `examples` (raw features); the same examples and settings give the same bits on
-/// the same kind of CPU, for any number of threads.
+/// Trains a network on `examples` (raw features); as [`super::super::fit()`].
 ///
 /// # Panics
-/// When there is no example, or `batch`, `hidden` or `epochs` is zero.
-pub fn fit_explicit(examples: &Examples, settings: &Fit, tell: impl FnMut(Progress)) -> ExplicitModel {
-    assert!(!examples.is_empty() && settings.batch > 0 && settings.hidden > 0 && settings.epochs > 0);
+/// As [`super::super::fit()`].
+pub fn fit_explicit(
+    examples: &Split,
+    settings: &Fit,
+    from: Option<Checkpoint>,
+    tell: impl FnMut(Progress<'_>),
+) -> (ExplicitModel, Vec<Epoch>) {
+    settings.check(examples);
     let mut rng = fastrand::Rng::with_seed(settings.seed);
     let shape = ExplicitShape { hidden: settings.hidden };
-    let mut model = ExplicitModel::random(shape, examples, &mut rng);
-    descend(&mut model, examples, settings, &mut rng, tell);
-    model
+    let mut model = ExplicitModel::random(shape, &examples.training, &mut rng);
+    let epochs = descend(&mut model, examples, settings, rng, from, tell);
+    (model, epochs)
 }
 
 fn input(model: &ExplicitModel, examples: &Examples, i: u32) -> Input {

@@ -215,7 +215,7 @@ impl Recording {
                 }
             }
             detected.fill(seen.iter().flatten().map(|z| bbox(*z)).enumerate());
-            let (dx, dy) = global_shift(&shift, &predicted, &detected).unwrap_or_default();
+            let [dx, dy] = global_shift(&shift, &predicted, &detected).unwrap_or_default().by;
             self.shifts[frame] = [dx, dy];
             for (slot, seen) in live.iter_mut().zip(seen) {
                 if let Some(l) = slot {
