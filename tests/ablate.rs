@@ -235,3 +235,35 @@ fn networks_are_those_of_the_footage() {
     let message = refused(&run());
     assert!(message.contains("no network of the association \"implicit\""), "{message}");
 }
+
+#[test]
+fn the_core_is_timed_beside_peers() {
+    let Some(models) = infer_support::models() else { return };
+    let (folder, root) = world();
+    let bench = |peer: &str, more: &[&str]| {
+        Command::new(env!("CARGO_BIN_EXE_gakp"))
+            .args(["bench", "core", &root, "--det", "A", "--rounds", "2", "--peer", peer])
+            .args(more)
+            .env("GAKP_MODELS", &models)
+            .output()
+            .expect("run")
+    };
+    let svg = folder.path().join("core.svg").display().to_string();
+    // The shell's comment swallows the root and the set that the command is given.
+    let output = bench("echo 'slow one 1000000 us/frame' #", &["--json", "--plot", &svg]);
+    let report: Value = serde_json::from_str(&stdout(&output)).expect("JSON");
+    let set = &report["sets"][0];
+    assert_eq!((&set["frames"], &set["densest"]["sequence"]), (&160.into(), &"MOT17-92-A".into()), "{set}");
+    let us = |row: &Value| row["us"][0].as_f64().expect("a time");
+    let ways: Vec<f64> = set["ways"].as_array().expect("ways").iter().map(us).collect();
+    assert!(ways.iter().all(|us| (0.01..1e6).contains(us)), "{ways:?}");
+    assert_eq!(set["peers"][0][0], "slow one");
+    assert!(set["fastest_peer_ratio"][0].as_f64().expect("a ratio") > 1.0, "{set}");
+    assert_eq!(report["crowd"][7]["people"], 500);
+    assert!(std::fs::read_to_string(svg).expect("a picture").contains("tracks, and detections a frame"));
+
+    let silent = refused(&bench("true #", &[]));
+    assert!(silent.contains("the peer printed no `NAME X us/frame`"), "{silent}");
+    let failing = refused(&bench("echo broken >&2; exit 3 #", &[]));
+    assert!(failing.contains("the peer failed") && failing.contains("broken"), "{failing}");
+}
