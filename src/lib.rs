@@ -45,6 +45,8 @@ pub mod mot;
 pub mod chart;
 #[cfg(feature = "learn")]
 pub mod learn;
+#[cfg(feature = "cli")]
+pub mod simulate;
 
 #[cfg(feature = "cli")]
 pub mod cli;

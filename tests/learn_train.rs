@@ -168,3 +168,12 @@ fn the_shipped_network_is_a_link_model_that_names_its_licence() {
     assert!(metadata["licence"].contains("CC BY-NC-SA 3.0"));
     assert!(!metadata["sequences"].contains("TUD-"), "the demo footage is for testing");
 }
+
+#[test]
+fn the_other_shipped_network_has_seen_simulated_people_alone() {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/gakp-gru-sim.onnx");
+    let (_, metadata) = onnx::read(&fs::read(&file).expect("a file")).expect("a link model");
+    assert!(metadata["sequences"].split(' ').all(|name| name.starts_with("SIM-1-")), "{metadata:?}");
+    assert!(metadata["licence"].starts_with("none: simulated"));
+    assert!(metadata["filter"].contains("centre_walk") && metadata.contains_key("existence"));
+}

@@ -1,4 +1,4 @@
-//! `gakp eval` as a user runs it.
+//! `gakp eval` and `gakp simulate` as a user runs them.
 #![cfg(feature = "cli")]
 
 use std::path::{Path, PathBuf};
@@ -134,4 +134,34 @@ fn mistakes_end_with_one_message_and_code_2() {
     let output = eval(&gt, &results, &["--det", "SDP"]);
     assert_eq!(output.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&output.stderr).contains("expected folders SEQ-SDP/ with gt/gt.txt"));
+}
+
+#[test]
+fn a_simulated_world_is_written_as_sequences_and_is_the_same_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let simulate = |out: &Path, more: &[&str]| {
+        Command::new(env!("CARGO_BIN_EXE_gakp")).arg("simulate").arg(out).args(more).output().unwrap()
+    };
+    let (a, b) = (folder.path().join("a"), folder.path().join("b"));
+    let small = ["--sequences", "2", "--seconds", "4", "--seed", "7"];
+    assert!(stdout(&simulate(&a, &small)).starts_with("wrote 2 sequences of 4 s"));
+    stdout(&simulate(&b, &small));
+    let read = |root: &Path, file: &str| std::fs::read_to_string(root.join("SIM-7-02").join(file)).unwrap();
+    for file in ["seqinfo.ini", "gt/gt.txt", "det/det.txt"] {
+        assert_eq!(read(&a, file), read(&b, file), "{file}");
+    }
+    // The truth scores itself without a mistake.
+    let results = folder.path().join("results");
+    std::fs::create_dir_all(&results).unwrap();
+    for name in ["SIM-7-01", "SIM-7-02"] {
+        std::fs::copy(a.join(name).join("gt/gt.txt"), results.join(format!("{name}.txt"))).unwrap();
+    }
+    let report: Value = serde_json::from_str(&stdout(&eval(&a, &results, &["--json"]))).unwrap();
+    let text = report.to_string();
+    assert!(text.contains("\"IDF1\":1.0") || text.contains("\"IDF1\":100.0"), "{text}");
+
+    std::fs::write(folder.path().join("file"), "").unwrap();
+    let refused = simulate(&folder.path().join("file"), &small);
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&refused.stderr).contains("cannot create"));
 }

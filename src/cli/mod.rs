@@ -13,6 +13,7 @@ mod models;
 pub mod serve;
 #[cfg(any(feature = "service", feature = "testcam"))]
 mod signals;
+pub mod simulate;
 #[cfg(feature = "service")]
 pub mod track;
 #[cfg(feature = "learn")]
@@ -57,6 +58,8 @@ pub enum Command {
     /// Measure speed beside its limit.
     #[cfg(feature = "service")]
     Bench(bench::Args),
+    /// Write a simulated world of pedestrians as MOTChallenge sequences.
+    Simulate(simulate::Args),
     /// Train the link scorer on MOTChallenge sequences.
     #[cfg(feature = "learn")]
     Train(train::Args),
@@ -83,6 +86,7 @@ pub fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Camera(args) => camera::run(args),
         #[cfg(feature = "service")]
         Command::Bench(args) => bench::run(args),
+        Command::Simulate(args) => simulate::run(args),
         #[cfg(feature = "learn")]
         Command::Train(args) => train::run(args),
         #[cfg(feature = "learn")]
