@@ -51,6 +51,9 @@ pub struct Args {
     /// Filters to try, for the noise of the centre and again for that of the size.
     #[arg(long, default_value_t = Settings::default().search.evaluations as u64, value_parser = clap::value_parser!(u64).range(10..=10_000))]
     pub evaluations: u64,
+    /// Filters to try after that, near the best one, by an evolution strategy (CMA-ES) that follows flat valleys.
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = clap::value_parser!(u64).range(0..=10_000))]
+    pub polish: u64,
     /// What is made small: `likelihood` (negative log-likelihood of what the errors are held against) or
     /// `consistency` (|ln(mean / n)| as Chen et al. have it, over several horizons).
     #[arg(long, default_value = Cost::default().name(), value_parser = cost)]
@@ -80,7 +83,12 @@ impl Args {
             statistic: if self.nis { Statistic::Nis } else { Statistic::Nees },
             cost: self.cost,
             trim,
-            search: Search { evaluations: self.evaluations as usize, seed: self.seed, ..default.search },
+            search: Search {
+                evaluations: self.evaluations as usize,
+                polish: self.polish as usize,
+                seed: self.seed,
+                ..default.search
+            },
         })
     }
 }
@@ -220,7 +228,8 @@ fn simulated(args: &Args, settings: &Settings) -> Result<()> {
 fn with_bar(start: &FilterConfig, on: &[&Recording], settings: &Settings, name: &str) -> Result<Tuned> {
     let form = "{msg} {wide_bar} {pos}/{len} {eta}";
     let style = ProgressStyle::with_template(form).unwrap_or_else(|_| ProgressStyle::default_bar());
-    let bar = ProgressBar::new(2 * settings.search.evaluations as u64).with_style(style);
+    let bar =
+        ProgressBar::new(2 * (settings.search.evaluations + settings.search.polish) as u64).with_style(style);
     let mut least: [f64; 2] = [f64::INFINITY; 2];
     let tuned = tune(start, on, settings, |group, trial| {
         let least = &mut least[group as usize];

@@ -43,7 +43,7 @@ impl Default for Settings {
             statistic: Statistic::Nees,
             cost: Cost::default(),
             trim: 0.0,
-            search: Search { evaluations: 240, reach: 12.0, rounds: 4, shrink: 0.3, seed: 1 },
+            search: Search { evaluations: 240, polish: 0, reach: 12.0, rounds: 4, shrink: 0.3, seed: 1 },
         }
     }
 }

@@ -10,7 +10,7 @@ use crate::track::kalman::BoxFilter;
 use crate::track::motion::{measurement_noise, motion, newborn};
 use crate::track::nearby::Nearby;
 use crate::track::shift::global_shift;
-use crate::track::{FrameInput, LifeConfig, LinkRequest, ShiftConfig, Tracker, TrackerConfig};
+use crate::track::{FilterConfig, FrameInput, LifeConfig, LinkRequest, ShiftConfig, Tracker, TrackerConfig};
 use crate::types::{BBox, MediaTime};
 
 /// A sequence, person by person.
@@ -108,7 +108,8 @@ pub fn without_truth(folder: &Path, second_half: bool) -> Result<Recording, Data
         sequence = sequence.second_half();
     }
     let Sequence { info, detections } = sequence;
-    let mut tracker = Tracker::new(TrackerConfig::default());
+    let config = TrackerConfig { filter: FilterConfig::hand_set(), ..TrackerConfig::default() };
+    let mut tracker = Tracker::new(config);
     let mut request = LinkRequest::default();
     let mut known: BTreeMap<u64, BTreeMap<usize, Point>> = BTreeMap::new();
     for (frame, detections) in detections.iter().enumerate() {
@@ -181,10 +182,10 @@ impl Recording {
         recording
     }
 
-    /// Estimates the camera's motion the way the tracker does, with its default filter. It is done once:
-    /// all filters that are tried see the same motion.
+    /// Estimates the camera's motion the way the tracker does, with the hand-set filter: the default one has
+    /// seen footage. It is done once: all filters that are tried see the same motion.
     fn find_shifts(&mut self) {
-        let config = TrackerConfig::default();
+        let config = TrackerConfig { filter: FilterConfig::hand_set(), ..TrackerConfig::default() };
         let shift = ShiftConfig::default();
         let lost = LifeConfig::default().lost;
         struct Live {
