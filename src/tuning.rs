@@ -1,7 +1,7 @@
 //! The tuning file: noise of the Kalman filter, as `gakp tune` writes it and `serve` and `track` take it.
 //!
 //! ```toml
-//! [filter]                     # names and units of `FilterConfig`; what is left out keeps its default
+//! [filter]                     # names and units of `FilterConfig`; what is left out stays the link network's, or the default
 //! centre_acceleration = 0.41
 //! centre_measurement = 0.038
 //!

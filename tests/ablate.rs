@@ -258,7 +258,11 @@ fn the_core_is_timed_beside_peers() {
     let ways: Vec<f64> = set["ways"].as_array().expect("ways").iter().map(us).collect();
     assert!(ways.iter().all(|us| (0.01..1e6).contains(us)), "{ways:?}");
     assert_eq!(set["peers"][0][0], "slow one");
-    assert!(set["fastest_peer_ratio"][0].as_f64().expect("a ratio") > 1.0, "{set}");
+    let ratio = set["fastest_peer_ratio"][1].as_f64().expect("the least ratio");
+    let most = set["ways"][1]["us"][2].as_f64().expect("the slowest round");
+    assert!((ratio * most / 1e6 - 1.0).abs() < 1e-9, "the peer over IOU + motion: {set}");
+    let typo = refused(&bench("true #", &["--second-half", "B"]));
+    assert!(typo.contains("--second-half B: it is not among the sets of --det"), "{typo}");
     assert_eq!(report["crowd"][7]["people"], 500);
     assert!(std::fs::read_to_string(svg).expect("a picture").contains("tracks, and detections a frame"));
 

@@ -160,6 +160,8 @@ fn a_simulated_world_is_written_as_sequences_and_is_the_same_again() {
     let text = report.to_string();
     assert!(text.contains("\"IDF1\":1.0") || text.contains("\"IDF1\":100.0"), "{text}");
 
+    let other = simulate(&a, &["--sequences", "1", "--seconds", "4", "--seed", "7"]);
+    assert!(String::from_utf8_lossy(&other.stderr).contains("already holds SIM-7-02 of another world"));
     std::fs::write(folder.path().join("file"), "").unwrap();
     let refused = simulate(&folder.path().join("file"), &small);
     assert_eq!(refused.status.code(), Some(2));

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::PathBuf;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 
 use crate::mot::{write_detections, write_truth};
 use crate::simulate::simulate;
@@ -33,12 +33,23 @@ pub struct Args {
 /// # Errors
 /// Files that cannot be written.
 pub fn run(args: Args) -> Result<()> {
+    let names: Vec<String> =
+        (1..=args.sequences).map(|index| format!("SIM-{}-{index:02}", args.seed)).collect();
+    // Whoever trains on the folder trains on all that is in it.
+    for entry in fs::read_dir(&args.out).into_iter().flatten().flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        let foreign = name.starts_with("SIM-") && !names.contains(&name);
+        ensure!(
+            !foreign,
+            "{} already holds {name} of another world: give an empty folder",
+            args.out.display()
+        );
+    }
     let (mut people, mut boxes) = (0, 0);
-    for index in 1..=args.sequences {
-        let name = format!("SIM-{}-{index:02}", args.seed);
-        let seed = u64::from(args.seed) << 32 | u64::from(index);
-        let world = simulate(&name, f64::from(args.seconds), seed);
-        let folder = args.out.join(&name);
+    for (index, name) in (1u64..).zip(&names) {
+        let seed = u64::from(args.seed) << 32 | index;
+        let world = simulate(name, f64::from(args.seconds), seed);
+        let folder = args.out.join(name);
         for (file, text) in [
             ("seqinfo.ini", world.info.write()),
             ("gt/gt.txt", write_truth(&world.truth)),

@@ -307,6 +307,8 @@ impl CheckpointFile {
             );
             println!("{}: going on after epoch {}", path.display(), saved.state.epochs.len());
             found = Some(saved.state);
+        } else if args.resume {
+            println!("{}: there is none, the run begins anew", path.display());
         }
         Ok(Self { path, fingerprint, found })
     }
@@ -347,6 +349,9 @@ fn curves(networks: &[(String, Vec<Epoch>)]) -> Result<String> {
 fn filter(args: &Args, out: &Path) -> Result<(FilterConfig, String)> {
     let default = FilterConfig::default();
     let Some(file) = &args.tuning else {
+        if args.loso.is_some() {
+            tracing::warn!("no --tuning: the filter is the program's own, {}", FilterConfig::TUNED_ON);
+        }
         return Ok((default, format!("the program's own, {}", FilterConfig::TUNED_ON)));
     };
     let file = match &args.loso {

@@ -6,11 +6,12 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use super::linker::LinkModel;
+use super::manifest::Family;
 use super::models::{Chosen, Plan, Reid, link_alone};
 use super::{Arrangement, BatchModel, InferError, ModelSettings, Task};
 use crate::detect::{DetectModel, DetectSpec};
 use crate::embed::{EmbedJob, EmbedModel, NetworkModel};
-use crate::track::{LinkRequest, TrackerConfig};
+use crate::track::{Association, LinkRequest, TrackerConfig};
 use crate::types::{BBox, Image};
 
 /// What the models are asked about one frame.
@@ -123,12 +124,16 @@ pub fn models_alone(
 pub struct LinkAlone(LinkModel);
 
 impl LinkAlone {
-    /// Loads the link scorer that `settings` name.
+    /// Loads the link scorer that `settings` name, one of the implicit association.
     ///
     /// # Errors
-    /// As [`super::Linker::load`].
+    /// As [`super::Linker::load`] and [`super::Linker::check_suits`].
     pub fn load(settings: &ModelSettings) -> Result<Self, InferError> {
         let (runtime, Chosen { entry, file }) = link_alone(settings)?;
+        if entry.family != Family::Gru {
+            let association = Association::Implicit.as_str();
+            return Err(InferError::Association { name: entry.name, association });
+        }
         Ok(Self(LinkModel::load(&runtime, &entry.name, &file)?))
     }
 

@@ -126,8 +126,7 @@ impl Card {
         out.push_str(
             "\n## Limits\nPeople, seen mostly from the front and the side, at 7 to 30 frames a second. After a \
              gap of about 2 s boxes alone say little. Probabilities are for the pairs that the tracker's gate \
-             lets through; they are trained with weights that favour hard pairs and are not exactly \
-             calibrated (see the error above).\n",
+             lets through; they are trained with weights that favour hard pairs and are not exactly calibrated.\n",
         );
         out
     }
@@ -137,7 +136,7 @@ fn unseen_section(unseen: &[Unseen]) -> String {
     let mut out = String::from(
         "\n## Scores on footage that it did not see\n\
          One network of this recipe for each footage, trained without it and without its copies by other \
-         detectors; the tracker with its default settings. AUC, cross-entropy and calibration error are of \
+         detectors, with a filter of its own where tunings were given; the tracker with its default settings else. AUC, cross-entropy and calibration error are of \
          the pairs that the tracker asks about while it is driven by the truth.\n\n\
          | sequence | pairs | AUC | cross-entropy | calibration error | HOTA | MOTA | IDF1 | IDs |\n\
          | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n",

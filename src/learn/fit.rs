@@ -72,7 +72,8 @@ impl Checkpoint {
     pub fn best_epoch(&self) -> Option<usize> {
         let last = self.epochs.len().checked_sub(1)?;
         let losses = self.epochs.iter().map(|e| e.validation).enumerate();
-        let found = losses.filter_map(|(i, loss)| Some((i, loss?))).min_by(|a, b| a.1.total_cmp(&b.1));
+        let finite = losses.filter_map(|(i, loss)| Some((i, loss.filter(|l| l.is_finite())?)));
+        let found = finite.min_by(|a, b| a.1.total_cmp(&b.1));
         Some(found.map_or(last, |(i, _)| i))
     }
 }

@@ -1,5 +1,6 @@
 #!/usr/bin/env python3
-"""Other people's trackers on MOTChallenge detections: default settings, one thread, update() alone timed.
+"""Other people's trackers on MOTChallenge detections: one thread, update() alone timed. Default settings, but for
+pyxtrackers' ByteTrack, which has the thresholds of its paper's code (0.6, 0.9) instead of the package's (0.5, 0.8).
 
   core.py ROOT DET [--second-half]
 

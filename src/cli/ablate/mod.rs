@@ -72,8 +72,11 @@ pub fn run(args: Args) -> Result<()> {
             // The same filter and the same decision on what is output for every row, so that only the
             // association differs.
             let mut base = TrackerConfig::default();
-            if let Some(linker) = networks.get(Association::Implicit, &world.footage)? {
-                base = linker.calibrate(base);
+            for association in [Association::Implicit, Association::Explicit] {
+                if let Some(linker) = networks.get(association, &world.footage)? {
+                    base = linker.calibrate(base);
+                    break;
+                }
             }
             let variants = variant::all(&config.tracker.apply(base)?);
             variants.iter().map(|variant| measure(world, variant, &mut networks)).collect()

@@ -54,6 +54,9 @@ pub struct Args {
 pub fn run(args: Args) -> Result<()> {
     let mut settings = ModelConfig::from(args.models.clone()).settings()?;
     settings.threads = Some(1);
+    for det in &args.second_half {
+        ensure!(args.det.contains(det), "--second-half {det}: it is not among the sets of --det");
+    }
     let mut linker = LinkAlone::load(&settings)?;
     let ways = Way::all(&linker);
     let mut report = Report { rounds: args.rounds, sets: vec![], crowd: vec![] };
@@ -84,16 +87,19 @@ struct Way {
 impl Way {
     /// The whole step is the last one.
     fn all(linker: &LinkAlone) -> Vec<Self> {
-        let plain = |method: Association| {
-            let mut config = TrackerConfig::default();
+        let way = |name, method: Association, head: bool| {
+            let mut config = linker.calibrate(TrackerConfig::default());
             config.association.method = method;
-            config
+            if !head {
+                config.existence.head = None;
+            }
+            Way { name, config }
         };
         vec![
-            Way { name: "IOU", config: plain(Association::Iou) },
-            Way { name: "IOU + motion", config: plain(Association::IouMotion) },
-            Way { name: "GAKP, no existence head", config: plain(Association::Implicit) },
-            Way { name: "GAKP", config: linker.calibrate(plain(Association::Implicit)) },
+            way("IOU", Association::Iou, false),
+            way("IOU + motion", Association::IouMotion, false),
+            way("GAKP, no existence head", Association::Implicit, false),
+            way("GAKP", Association::Implicit, true),
         ]
     }
 }
