@@ -1,30 +1,20 @@
 //! The graph of explicit features: weights of every track, weighted costs of every pair.
 
 use super::super::explicit::ExplicitModel;
-use super::graph::{Builder, GRU_W, int, ints, to_gru_op};
+use super::graph::{Builder, int};
 use super::proto::GraphProto;
 use crate::track::association::explicit::{COST_LIMITS, COSTS, LEAST_DT};
-use crate::track::{STEP_FEATURES, features};
+use crate::track::features;
 
 /// The graph of `model`; inputs and output are those of the implicit network.
 pub(super) fn build(model: &ExplicitModel) -> GraphProto {
     let shape = model.shape;
-    let (h, g) = (shape.hidden, 3 * shape.hidden);
+    let h = shape.hidden;
     let part = |range: std::ops::Range<usize>| &model.theta[range];
     let mut b = Builder::new("gakp-explicit");
 
     // Histories to weights, [T, COSTS].
-    b.normalise("histories", "histories.z", ["history.mean", "history.scale"], &model.history);
-    b.node("Transpose", &["histories.z"], &["steps"], vec![ints("perm", &[1, 0, 2])]);
-    b.floats(GRU_W, &[1, g, STEP_FEATURES], &to_gru_op(part(shape.w()), STEP_FEATURES, h));
-    b.floats("gru.R", &[1, g, h], &to_gru_op(part(shape.u()), h, h));
-    let mut bias = to_gru_op(part(shape.b()), 1, h);
-    bias.resize(2 * g, 0.0);
-    b.floats("gru.B", &[1, 2 * g], &bias);
-    let attributes = vec![int("hidden_size", h as i64), int("linear_before_reset", 0)];
-    b.node("GRU", &["steps", GRU_W, "gru.R", "gru.B", "lengths"], &["", "state.1"], attributes);
-    b.integers("axis.0", &[0]);
-    b.node("Squeeze", &["state.1", "axis.0"], &["state"], vec![]);
+    b.encode_histories(&model.history, part(shape.w()), part(shape.u()), part(shape.b()));
     b.floats("weights.V", &[h, COSTS], part(shape.v()));
     b.floats("weights.v", &[COSTS], part(shape.v0()));
     b.node("Gemm", &["state", "weights.V", "weights.v"], &["weights.raw"], vec![]);

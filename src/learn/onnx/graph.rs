@@ -109,6 +109,24 @@ impl Builder {
         self.node("Mul", &[&centred, scale], &[&scaled], vec![]);
         self.node("Clip", &[&scaled, "clip.low", "clip.high"], &[output], vec![]);
     }
+
+    /// Histories to states: `state`, `[T, H]`, of a GRU with weights `w [STEP_FEATURES, 3 H]`, `u [H, 3 H]`
+    /// and biases `bias [3 H]`, gates r, z, c. Leaves `axis.0` for other squeezes.
+    pub(super) fn encode_histories(&mut self, normaliser: &Normaliser, w: &[f32], u: &[f32], bias: &[f32]) {
+        let g = bias.len();
+        let h = g / 3;
+        self.normalise("histories", "histories.z", [HISTORY_MEAN, HISTORY_SCALE], normaliser);
+        self.node("Transpose", &["histories.z"], &["steps"], vec![ints("perm", &[1, 0, 2])]);
+        self.floats(GRU_W, &[1, g, STEP_FEATURES], &to_gru_op(w, STEP_FEATURES, h));
+        self.floats("gru.R", &[1, g, h], &to_gru_op(u, h, h));
+        let mut biases = to_gru_op(bias, 1, h);
+        biases.resize(2 * g, 0.0);
+        self.floats("gru.B", &[1, 2 * g], &biases);
+        let attributes = vec![int("hidden_size", h as i64), int("linear_before_reset", 0)];
+        self.node("GRU", &["steps", GRU_W, "gru.R", "gru.B", "lengths"], &["", "state.1"], attributes);
+        self.integers("axis.0", &[0]);
+        self.node("Squeeze", &["state.1", "axis.0"], &["state"], vec![]);
+    }
 }
 
 pub(super) fn int(name: &str, value: i64) -> AttributeProto {
@@ -155,7 +173,7 @@ fn ours(column: usize, hidden: usize) -> (usize, f32) {
 /// `[rows, 3 H]` of gates r, z, c to what ONNX's GRU wants: `[3 H, rows]`, gates z, r, c, and z
 /// negated, because ONNX's z keeps the old state where the paper's takes the new one and
 /// `1 - sigmoid(a) = sigmoid(-a)`.
-pub(super) fn to_gru_op(weights: &[f32], rows: usize, hidden: usize) -> Vec<f32> {
+fn to_gru_op(weights: &[f32], rows: usize, hidden: usize) -> Vec<f32> {
     let gates = 3 * hidden;
     (0..gates)
         .flat_map(|column| {
@@ -184,19 +202,8 @@ pub(super) fn build(model: &LinkModel) -> GraphProto {
     let (shape, h, g) = (gru.shape, gru.shape.hidden, 3 * gru.shape.hidden);
     let mut b = Builder::new("gakp-link");
 
-    // Histories to states, [T, H].
-    b.normalise("histories", "histories.z", [HISTORY_MEAN, HISTORY_SCALE], &model.history);
-    b.node("Transpose", &["histories.z"], &["steps"], vec![ints("perm", &[1, 0, 2])]);
     let u = gru.part(shape.u());
-    b.floats(GRU_W, &[1, g, STEP_FEATURES], &to_gru_op(gru.part(shape.w_history()), STEP_FEATURES, h));
-    b.floats("gru.R", &[1, g, h], &to_gru_op(u, h, h));
-    let mut bias = to_gru_op(gru.part(shape.b()), 1, h);
-    bias.resize(2 * g, 0.0);
-    b.floats("gru.B", &[1, 2 * g], &bias);
-    let attributes = vec![int("hidden_size", h as i64), int("linear_before_reset", 0)];
-    b.node("GRU", &["steps", GRU_W, "gru.R", "gru.B", "lengths"], &["", "state.1"], attributes);
-    b.integers("axis.0", &[0]);
-    b.node("Squeeze", &["state.1", "axis.0"], &["state"], vec![]);
+    b.encode_histories(&model.history, gru.part(shape.w_history()), u, gru.part(shape.b()));
 
     // What the state adds to r and z of the last step, once a track; then by pair.
     let rows = || u.chunks_exact(g);
