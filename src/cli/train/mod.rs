@@ -1,26 +1,28 @@
 //! `gakp train`: trains the link network on MOTChallenge folders.
 
+mod checkpoint;
+mod report;
+mod tracked;
+
 use std::collections::BTreeMap;
-use std::convert::Infallible;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::{fs, thread};
 
 use anyhow::{Context, Result, bail, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use sha2::{Digest, Sha256};
 
-use crate::chart::{Line, Panel, svg};
 use crate::learn::card::{Card, MOTCHALLENGE_LICENCE, Unseen};
 use crate::learn::dataset::{self, LabelledSequence};
-use crate::learn::network::{Network, Scorer};
-use crate::learn::{
-    Boxes, Checkpoint, Epoch, Examples, Fit, HeadFit, Recipe, Split, Teacher, fit_head, metrics,
-};
-use crate::mot::{Benchmark, Row, Sequence, SequenceInfo, evaluate, first_half_length, parse_truth, replay};
-use crate::track::{Association, ExistenceHead, FilterConfig, TrackerConfig};
+use crate::learn::network::Network;
+use crate::learn::{Epoch, Fit, HeadFit, Recipe, Split, Teacher, fit_head};
+use crate::track::{Association, FilterConfig, TrackerConfig};
 use crate::tuning::{FilterTuning, Tuning};
+use checkpoint::CheckpointFile;
+pub use report::Report;
+use report::{Trained, curves};
 
 /// Trains the network that says how probable it is that a detection continues a track.
 ///
@@ -88,30 +90,6 @@ pub struct Args {
     /// A report of a --loso run: its scores go into the model card.
     #[arg(long, value_name = "FILE")]
     pub unseen: Option<PathBuf>,
-}
-
-/// What came of the training.
-#[derive(Clone, Debug, Default, Serialize, Deserialize)]
-pub struct Report {
-    /// One entry a network: its file's name and its epochs.
-    #[serde(default)]
-    pub epochs: Vec<(String, Vec<Epoch>)>,
-    /// One entry a held-out sequence.
-    pub unseen: Vec<Unseen>,
-}
-
-impl Report {
-    fn add(&mut self, trained: Trained) {
-        self.epochs.push((trained.name, trained.epochs));
-        self.unseen.extend(trained.unseen);
-    }
-}
-
-/// One network's part of the report.
-struct Trained {
-    name: String,
-    epochs: Vec<Epoch>,
-    unseen: Vec<Unseen>,
 }
 
 /// A sequence and where its files are.
@@ -216,14 +194,14 @@ fn train(
     };
     let mut checkpoint = CheckpointFile::open(args, out, &settings, &examples)?;
     let (model, epochs) = run_fit(args.association.parse()?, &settings, &examples, &name, &mut checkpoint);
-    let boxes = boxes(&model, &tracker, &seen, &args.second_half, &name)?;
+    let boxes = tracked::boxes(&model, &tracker, &seen, &args.second_half, &name)?;
     ensure!(!boxes.is_empty(), "the tracker confirms no track in the training sequences");
     let head_fit = HeadFit { seed: args.seed, ..HeadFit::default() };
     let head = Arc::new(fit_head(&boxes, &head_fit));
 
     let mut scores = vec![];
     for source in &held {
-        let found = score(&model, &tracker, &head, source, &args.second_half)?;
+        let found = tracked::score(&model, &tracker, &head, source, &args.second_half)?;
         println!(
             "{name} {}: {} pairs, AUC {:.4}, cross-entropy {:.4}, calibration error {:.4}; HOTA {:.2} MOTA {:.2} IDF1 {:.2} IDs {}",
             found.sequence,
@@ -270,79 +248,6 @@ fn train(
     checkpoint.remove();
     println!("wrote {} ({} examples)", out.display(), examples.training.len());
     Ok(Trained { name: card.file, epochs, unseen: scores })
-}
-
-/// Where a run leaves its state after every epoch.
-struct CheckpointFile {
-    path: PathBuf,
-    /// What the state belongs to: settings and examples.
-    fingerprint: String,
-    /// State to go on from.
-    found: Option<Checkpoint>,
-}
-
-#[derive(Serialize, Deserialize)]
-struct Saved {
-    fingerprint: String,
-    state: Checkpoint,
-}
-
-impl CheckpointFile {
-    fn open(args: &Args, out: &Path, fit: &Fit, examples: &Split) -> Result<Self> {
-        let path = out.with_added_extension("checkpoint");
-        // The number of threads does not change the result.
-        let settings = Fit { threads: 1, ..fit.clone() };
-        let digest: String = examples.fingerprint().iter().map(|byte| format!("{byte:02x}")).collect();
-        let fingerprint = format!("{} {settings:?} {digest}", args.association);
-        let mut found = None;
-        if args.resume && path.is_file() {
-            let text =
-                fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
-            let saved: Saved = serde_json::from_str(&text)
-                .with_context(|| format!("{} is no checkpoint: delete it to begin anew", path.display()))?;
-            ensure!(
-                saved.fingerprint == fingerprint,
-                "{} is of other data or settings: give the same as then, or leave --resume out to begin anew",
-                path.display()
-            );
-            println!("{}: going on after epoch {}", path.display(), saved.state.epochs.len());
-            found = Some(saved.state);
-        } else if args.resume {
-            println!("{}: there is none, the run begins anew", path.display());
-        }
-        Ok(Self { path, fingerprint, found })
-    }
-
-    /// Written beside its place first: an interrupted write leaves the last state.
-    fn save(&self, state: &Checkpoint) -> Result<()> {
-        let saved = Saved { fingerprint: self.fingerprint.clone(), state: state.clone() };
-        let new = self.path.with_added_extension("new");
-        write(&new, serde_json::to_string(&saved)?.as_bytes())?;
-        fs::rename(&new, &self.path).with_context(|| format!("cannot write {}", self.path.display()))
-    }
-
-    fn remove(self) {
-        // Of no use any more; a later run without --resume does not look at it.
-        let _ = fs::remove_file(&self.path);
-    }
-}
-
-/// Losses by epoch, a panel for each network.
-fn curves(networks: &[(String, Vec<Epoch>)]) -> Result<String> {
-    let panel = |(name, epochs): &(String, Vec<Epoch>)| {
-        let line = |name: &str, of: &dyn Fn(&Epoch) -> Option<f64>| {
-            let points =
-                epochs.iter().enumerate().filter_map(|(i, epoch)| Some((i as f64 + 1.0, of(epoch)?)));
-            Line::new(name, points.collect())
-        };
-        Panel {
-            caption: name.clone(),
-            axes: ["epoch".into(), "weighted cross-entropy, nats".into()],
-            log: false,
-            lines: vec![line("training", &|e| Some(e.training)), line("validation", &|e| e.validation)],
-        }
-    };
-    Ok(svg(&networks.iter().map(panel).collect::<Vec<_>>(), networks.len().clamp(1, 2))?)
 }
 
 /// The filter that the network in `out` is for, and what it was tuned on.
@@ -429,101 +334,6 @@ fn run_fit(
 fn bar(length: u64, form: &str) -> ProgressBar {
     let style = ProgressStyle::with_template(form).unwrap_or_else(|_| ProgressStyle::default_bar());
     ProgressBar::new(length).with_style(style)
-}
-
-/// The frames of a sequence that count, and their truth, both from the first one on.
-fn counted(source: &Source, second_half: &[String]) -> Result<(bool, LabelledSequence, Vec<Row>)> {
-    let labelled = &source.labelled;
-    let half = second_half.iter().any(|s| labelled.name.strip_suffix(s).is_some_and(|n| n.ends_with('-')));
-    let length = labelled.frames.len() as u32;
-    let skip = if half { first_half_length(length).min(length) } else { 0 };
-    let mut sequence = labelled.clone();
-    sequence.frames.drain(..skip as usize);
-    let file = source.folder.join("gt/gt.txt");
-    let text = fs::read_to_string(&file).with_context(|| format!("cannot read {}", file.display()))?;
-    let mut truth = parse_truth(&text, Some(length)).with_context(|| file.display().to_string())?;
-    if half {
-        truth = crate::mot::second_half(&truth, length);
-    }
-    Ok((half, sequence, truth))
-}
-
-/// What the tracker puts out on the sequences that the network was trained on.
-fn boxes(
-    model: &Network,
-    tracker: &TrackerConfig,
-    seen: &[&Source],
-    second_half: &[String],
-    name: &str,
-) -> Result<Boxes> {
-    let bar = bar(seen.len() as u64, "{msg} {wide_bar} {pos}/{len}");
-    bar.set_message(format!("{name}: boxes"));
-    let mut scorer = Scorer::new(model.clone());
-    let mut config = tracker.clone();
-    config.association.method = model.association();
-    let mut boxes = Boxes::default();
-    for source in seen {
-        let (_, sequence, truth) = counted(source, second_half)?;
-        boxes.collect(&sequence, &truth, &config, |request| {
-            let mut links = vec![];
-            scorer.score(request, &mut links);
-            links
-        });
-        bar.inc(1);
-    }
-    bar.finish_and_clear();
-    Ok(boxes)
-}
-
-/// Pairs and tracks of a sequence under a network and a head that have not seen it.
-fn score(
-    model: &Network,
-    tracker: &TrackerConfig,
-    head: &Arc<ExistenceHead>,
-    source: &Source,
-    second_half: &[String],
-) -> Result<Unseen> {
-    let (half, counted, truth) = counted(source, second_half)?;
-    let length = counted.frames.len() as u32;
-    let mut pairs = Examples::default();
-    let teacher = Teacher { filter: tracker.filter, ..Teacher::natural() };
-    teacher.collect(&counted, &mut fastrand::Rng::with_seed(0), &mut pairs);
-    let link = metrics::scores(&model.logits(&pairs), pairs.labels(), pairs.weights());
-
-    let sequence = Sequence {
-        info: SequenceInfo {
-            name: counted.name.clone(),
-            frame_rate: counted.frame_rate,
-            length,
-            width: counted.width as u32,
-            height: counted.height as u32,
-        },
-        detections: counted.frames.iter().map(|f| f.detections.clone()).collect(),
-    };
-    let mut scorer = Scorer::new(model.clone());
-    let links = |request: &_| {
-        let mut links = vec![];
-        scorer.score(request, &mut links);
-        Ok::<_, Infallible>(links)
-    };
-    let mut config = tracker.clone();
-    config.association.method = model.association();
-    config.existence.head = Some(head.clone());
-    let rows = replay(&sequence, &config, |_| vec![], links)?;
-    let tracks = evaluate(&truth, &rows, length, Benchmark::of(&counted.name, &truth))
-        .with_context(|| counted.name.clone())?;
-    Ok(Unseen {
-        sequence: counted.name.clone(),
-        second_half: half,
-        pairs: pairs.len(),
-        auc: link.auc,
-        loss: link.loss,
-        calibration_error: link.calibration_error,
-        hota: 100.0 * tracks.hota.hota(),
-        mota: 100.0 * tracks.clear.mota(),
-        idf1: 100.0 * tracks.identity.idf1(),
-        id_switches: tracks.clear.idsw,
-    })
 }
 
 fn describe(
