@@ -36,14 +36,17 @@ pub fn run(args: Args) -> Result<()> {
     let names: Vec<String> =
         (1..=args.sequences).map(|index| format!("SIM-{}-{index:02}", args.seed)).collect();
     // Whoever trains on the folder trains on all that is in it.
-    for entry in fs::read_dir(&args.out).into_iter().flatten().flatten() {
-        let name = entry.file_name().to_string_lossy().into_owned();
-        let foreign = name.starts_with("SIM-") && !names.contains(&name);
-        ensure!(
-            !foreign,
-            "{} already holds {name} of another world: give an empty folder",
-            args.out.display()
-        );
+    if args.out.is_dir() {
+        let unreadable = || format!("cannot read folder {}", args.out.display());
+        for entry in fs::read_dir(&args.out).with_context(unreadable)? {
+            let name = entry.with_context(unreadable)?.file_name().to_string_lossy().into_owned();
+            let foreign = name.starts_with("SIM-") && !names.contains(&name);
+            ensure!(
+                !foreign,
+                "{} already holds {name} of another world: give an empty folder",
+                args.out.display()
+            );
+        }
     }
     let (mut people, mut boxes) = (0, 0);
     for (index, name) in (1u64..).zip(&names) {
