@@ -11,7 +11,8 @@ use futures::executor::block_on;
 use futures::future::join_all;
 use gakp::infer::bench::{FrameWork, models_alone};
 use gakp::infer::{InferError, ModelSettings, Models, ProviderChoice};
-use gakp::track::{CANDIDATE_FEATURES, HISTORY, LinkRequest, Pair, STEP_FEATURES};
+use gakp::track::features::relative;
+use gakp::track::{Features, HISTORY, LinkRequest, Pair};
 use gakp::types::{BBox, ClassId, Image, YuvRange};
 use infer_support::{decode, fixture, image, models, settings, sha256};
 
@@ -196,9 +197,10 @@ fn colour_stripes_tell_colours_and_places_apart() {
 fn link_request() -> LinkRequest {
     let pattern = |n: usize| (0..n).map(|i| (i % 7) as f32 / 10.0 - 0.3).collect();
     LinkRequest {
-        histories: pattern(2 * HISTORY * STEP_FEATURES),
+        features: Features::Relative,
+        histories: pattern(2 * HISTORY * relative::STEP),
         lengths: vec![6, 2],
-        candidates: pattern(3 * CANDIDATE_FEATURES),
+        candidates: pattern(3 * relative::CANDIDATE),
         pairs: [1, 0, 1].map(|track| Pair { track, detection: 0 }).to_vec(),
     }
 }

@@ -6,54 +6,64 @@ mod learn_common;
 
 use gakp::learn::explicit::{Run, backward, encode, logit};
 use gakp::learn::{
-    Examples, ExplicitModel, ExplicitScorer, ExplicitShape, Fit, Split, fit_explicit, logits_explicit,
-    metrics,
+    Examples, ExplicitModel, ExplicitScorer, Fit, Split, fit_explicit, logits_explicit, metrics,
 };
 use gakp::track::association::explicit::COSTS;
-use gakp::track::{CANDIDATE_FEATURES, HISTORY, LinkRequest, STEP_FEATURES, features};
+use gakp::track::features::{appearance, relative};
+use gakp::track::{Features, HISTORY, LinkRequest};
+
+const FEATURES: [Features; 2] = [Features::Relative, Features::Appearance];
 use learn_common::request;
 
 /// Requests whose columns are what they are in the tracker: an IoU, a distance, a time.
-fn real(tracks: usize, pairs: usize, rng: &mut fastrand::Rng) -> LinkRequest {
-    let mut request = request(tracks, pairs, rng);
-    for row in request.candidates.chunks_exact_mut(CANDIDATE_FEATURES) {
-        row[features::IOU] = rng.f32();
-        row[features::MAHALANOBIS] = rng.f32();
-        row[features::DT] = 0.04 * (1 + rng.u32(0..5)) as f32;
-        row[features::INNOVATION] = 0.2 * (rng.f32() - 0.5);
-        row[features::INNOVATION + 1] = 0.2 * (rng.f32() - 0.5);
+fn real(features: Features, tracks: usize, pairs: usize, rng: &mut fastrand::Rng) -> LinkRequest {
+    let mut request = request(features, tracks, pairs, rng);
+    for row in request.candidates.chunks_exact_mut(features.candidate()) {
+        row[relative::IOU] = rng.f32();
+        row[relative::MAHALANOBIS] = rng.f32();
+        row[relative::DT] = 0.04 * (1 + rng.u32(0..5)) as f32;
+        row[relative::INNOVATION] = 0.2 * (rng.f32() - 0.5);
+        row[relative::INNOVATION + 1] = 0.2 * (rng.f32() - 0.5);
+        if features == Features::Appearance {
+            row[appearance::MEAN_COSINE] = rng.f32();
+            row[appearance::KNOWN] = f32::from(rng.u8(0..2));
+        }
     }
     request
 }
 
 /// Whether overlap counts is told by the first observation of the track: only weights that a network
 /// reads from the history can do it.
-fn examples(requests: usize, rng: &mut fastrand::Rng) -> Examples {
-    let mut examples = Examples::default();
+fn examples(features: Features, requests: usize, rng: &mut fastrand::Rng) -> Examples {
+    let mut examples = Examples::of(features);
     for _ in 0..requests {
-        let request = real(7, 20, rng);
+        let request = real(features, 7, 20, rng);
         examples.push(&request, |pair| {
-            let first = request.histories[request.pairs[pair].track as usize * HISTORY * STEP_FEATURES + 3];
-            let row = &request.candidates[pair * CANDIDATE_FEATURES..];
-            let by_overlap = row[features::IOU] > 0.5;
-            let by_distance = row[features::MAHALANOBIS] < 0.5;
+            let first = request.histories[request.pairs[pair].track as usize * HISTORY * relative::STEP + 3];
+            let row = &request.candidates[pair * features.candidate()..];
+            let by_overlap = row[relative::IOU] > 0.5;
+            let by_distance = row[relative::MAHALANOBIS] < 0.5;
             Some((if first > 3.0 { by_overlap } else { by_distance }, 0.5 + rng.f32()))
         });
     }
     examples
 }
 
-fn model(hidden: usize, rng: &mut fastrand::Rng) -> (ExplicitModel, Examples) {
-    let examples = examples(2, rng);
-    let mut model = ExplicitModel::random(ExplicitShape { hidden }, &examples, rng);
+fn model(features: Features, hidden: usize, rng: &mut fastrand::Rng) -> (ExplicitModel, Examples) {
+    let examples = examples(features, 2, rng);
+    let mut model = ExplicitModel::random(hidden, &examples, rng);
     model.theta.iter_mut().for_each(|v| *v += 0.2 * (rng.f32() - 0.5));
     (model, examples)
 }
 
 #[test]
 fn gradients_equal_finite_differences() {
+    FEATURES.into_iter().for_each(gradients_equal);
+}
+
+fn gradients_equal(features: Features) {
     let mut rng = fastrand::Rng::with_seed(7);
-    let (model, examples) = model(5, &mut rng);
+    let (model, examples) = model(features, 5, &mut rng);
     let shape = model.shape;
     let inputs: Vec<(Vec<f64>, [f64; COSTS])> = (0..examples.len() as u32)
         .map(|i| {
@@ -90,7 +100,7 @@ fn gradients_equal_finite_differences() {
         let error = (gradient[i] - difference).abs();
         assert!(
             error < 1e-6 * difference.abs() + 1e-7 * scale,
-            "parameter {i}: gradient {}, finite difference {difference}",
+            "{features}: parameter {i}: gradient {}, finite difference {difference}",
             gradient[i]
         );
     }
@@ -99,16 +109,17 @@ fn gradients_equal_finite_differences() {
 #[test]
 fn weights_are_positive_and_follow_the_history() {
     let mut rng = fastrand::Rng::with_seed(3);
-    let (seen, unseen) = (examples(300, &mut rng), examples(50, &mut rng));
+    let (seen, unseen) =
+        (examples(Features::Relative, 300, &mut rng), examples(Features::Relative, 50, &mut rng));
     let settings = Fit { hidden: 12, epochs: 12, batch: 64, rate: 0.01, ..Fit::default() };
     let (model, _) = fit_explicit(&seen.into(), &settings, None, |_| {});
     let found = metrics::scores(&logits_explicit(&model, &unseen), unseen.labels(), unseen.weights());
     assert!(found.auc > 0.95, "area under the curve on unseen examples: {}", found.auc);
-    let (mut scorer, request) = (ExplicitScorer::new(model), real(12, 1, &mut rng));
+    let (mut scorer, request) = (ExplicitScorer::new(model), real(Features::Relative, 12, 1, &mut rng));
     let mut by_overlap = [(0.0, 0); 2];
-    for (rows, length) in request.histories.chunks_exact(HISTORY * STEP_FEATURES).zip(&request.lengths) {
-        let weights = scorer.weights(&rows[..*length as usize * STEP_FEATURES]);
-        assert!(weights.iter().all(|weight| *weight > 0.0), "{weights:?}");
+    for (rows, length) in request.histories.chunks_exact(HISTORY * relative::STEP).zip(&request.lengths) {
+        let weights = scorer.weights(&rows[..*length as usize * relative::STEP]);
+        assert!(weights[..COSTS - 1].iter().all(|weight| *weight > 0.0), "{weights:?}");
         let kind = &mut by_overlap[usize::from(rows[3] > 3.0)];
         *kind = (kind.0 + weights[1], kind.1 + 1);
     }
@@ -119,7 +130,7 @@ fn weights_are_positive_and_follow_the_history() {
 #[test]
 fn the_same_bits_for_any_number_of_threads() {
     let mut rng = fastrand::Rng::with_seed(5);
-    let examples = Split::from(examples(8, &mut rng));
+    let examples = Split::from(examples(Features::Relative, 8, &mut rng));
     let settings = |threads, seed| Fit { hidden: 6, epochs: 1, batch: 61, threads, seed, ..Fit::default() };
     let one = fit_explicit(&examples, &settings(1, 1), None, |_| {});
     for threads in 2..=4 {
@@ -141,8 +152,8 @@ fn onnx_runtime_equals_the_scorer() {
 
     let Some(folder) = infer_support::models() else { return };
     let mut rng = fastrand::Rng::with_seed(17);
-    for hidden in [1, 16] {
-        let (model, _) = model(hidden, &mut rng);
+    for (features, hidden) in FEATURES.into_iter().flat_map(|features| [(features, 1), (features, 16)]) {
+        let (model, _) = model(features, hidden, &mut rng);
         let written = tempfile::tempdir().expect("a folder");
         let file = written.path().join("explicit.onnx");
         std::fs::write(&file, onnx::write_explicit(&model, "a test", &Default::default())).expect("written");
@@ -165,12 +176,12 @@ fn onnx_runtime_equals_the_scorer() {
         assert!(refused.contains("no network of the association \"implicit\""), "{refused}");
         let (mut scorer, mut expected) = (ExplicitScorer::new(model), vec![]);
         for (tracks, pairs) in [(1, 1), (16, 40), (100, 400)] {
-            let request = real(tracks, pairs, &mut rng);
+            let request = real(features, tracks, pairs, &mut rng);
             scorer.score(&request, &mut expected);
             let found = linker.score_blocking(request).expect("probabilities");
             assert_eq!(found.len(), expected.len());
             for (found, expected) in found.iter().zip(&expected) {
-                assert!((found - expected).abs() <= 2e-5, "hidden {hidden}: {found}, {expected}");
+                assert!((found - expected).abs() <= 2e-5, "{features}, hidden {hidden}: {found}, {expected}");
             }
         }
         linker.shutdown();

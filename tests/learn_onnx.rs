@@ -7,15 +7,15 @@ use std::collections::BTreeMap;
 
 use gakp::learn::{GruScorer, LinkModel, literal, onnx};
 use gakp::track::LinkRequest;
-use learn_common::{examples, model, request};
+use learn_common::{FEATURES, examples, model, request};
 
 fn models() -> impl Iterator<Item = (usize, LinkModel, Vec<LinkRequest>)> {
     let mut rng = fastrand::Rng::with_seed(11);
-    let raw = examples(30, &mut rng);
-    [1, 8, 32, 134].into_iter().map(move |hidden| {
-        let model = model(hidden, &raw, &mut rng);
+    let kinds = FEATURES.into_iter().flat_map(|features| [1, 8, 32, 134].map(|hidden| (features, hidden)));
+    kinds.map(move |(features, hidden)| {
+        let model = model(hidden, &examples(features, 30, &mut rng), &mut rng);
         let sizes = [(1, 1), (1, 9), (13, 1), (16, 40), (100, 400)];
-        let requests = sizes.map(|(tracks, pairs)| request(tracks, pairs, &mut rng)).to_vec();
+        let requests = sizes.map(|(tracks, pairs)| request(features, tracks, pairs, &mut rng)).to_vec();
         (hidden, model, requests)
     })
 }
@@ -31,7 +31,11 @@ fn scorer_equals_the_literal_loop() {
             assert_eq!(found.len(), request.pairs.len());
             for (pair, p) in found.iter().enumerate() {
                 let exact = literal::probability(&model, request, pair);
-                assert!((f64::from(*p) - exact).abs() <= 1e-5, "hidden {hidden}, pair {pair}: {p}, {exact}");
+                assert!(
+                    (f64::from(*p) - exact).abs() <= 1e-5,
+                    "{}, hidden {hidden}, pair {pair}: {p}, {exact}",
+                    model.features()
+                );
             }
         }
         scorer.score(&LinkRequest::default(), &mut found);

@@ -1,8 +1,7 @@
 //! Each association of the paper on small scenes: whom it follows, and what it needs for that.
 
-use gakp::track::{
-    Association, CANDIDATE_FEATURES, FrameInput, LinkRequest, TrackError, Tracker, TrackerConfig, Update,
-};
+use gakp::track::features::relative;
+use gakp::track::{Association, FrameInput, LinkRequest, TrackError, Tracker, TrackerConfig, Update};
 use gakp::types::{BBox, Detection, Embedding, MediaTime, TrackId};
 
 const FPS: f64 = 25.0;
@@ -22,7 +21,7 @@ fn person(cx: f64, cy: f64) -> Detection {
 /// A scorer of geometry: overlap with the prediction (feature 14) and Mahalanobis distance (15).
 fn geometry(request: &LinkRequest) -> Vec<f32> {
     let pair = |f: &[f32]| 0.5 * f[14] + 0.5 * (-(f[15] * 5.0).powi(2) / 4.0).exp();
-    request.candidates.chunks(CANDIDATE_FEATURES).map(pair).collect()
+    request.candidates.chunks(relative::CANDIDATE).map(pair).collect()
 }
 
 /// Tracks `frames` of detections with embeddings; the update of every frame.

@@ -1,6 +1,7 @@
 //! Laws of the tracking core, with a scorer made of geometry alone: no model, no file, no clock.
 
-use gakp::track::{CANDIDATE_FEATURES, FrameInput, LinkRequest, TrackError, Tracker, TrackerConfig, Update};
+use gakp::track::features::relative;
+use gakp::track::{FrameInput, LinkRequest, TrackError, Tracker, TrackerConfig, Update};
 use gakp::types::{BBox, Detection, MediaTime, TrackId, TrackState};
 use proptest::prelude::*;
 use std::collections::BTreeSet;
@@ -10,7 +11,7 @@ const SIZE: (f64, f64) = (640.0, 480.0);
 /// A probability from the overlap with the prediction (feature 14) and the Mahalanobis distance (15).
 fn geometry(request: &LinkRequest) -> Vec<f32> {
     let pair = |f: &[f32]| 0.5 * f[14] + 0.5 * (-(f[15] * 5.0).powi(2) / 4.0).exp();
-    request.candidates.chunks(CANDIDATE_FEATURES).map(pair).collect()
+    request.candidates.chunks(relative::CANDIDATE).map(pair).collect()
 }
 
 fn step(tracker: &mut Tracker, seconds: f64, detections: &[Detection]) -> Update {

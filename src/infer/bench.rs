@@ -147,7 +147,7 @@ impl LinkAlone {
     /// # Errors
     /// The model's failure.
     pub fn score(&mut self, request: &LinkRequest) -> Result<Vec<f32>, InferError> {
-        super::linker::check(request)?;
+        self.0.check(request)?;
         let mut answers = self.0.run(std::slice::from_ref(request))?;
         Ok(answers.pop().unwrap_or_default())
     }
@@ -230,7 +230,7 @@ impl Instance {
                 if let Some(scorer) = &mut self.link
                     && !link.is_empty()
                 {
-                    super::linker::check(link)?;
+                    scorer.check(link)?;
                     scorer.run(std::slice::from_ref(link))?;
                 }
                 lap(&mut spent[2]);

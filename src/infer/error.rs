@@ -70,6 +70,20 @@ pub enum InferError {
         /// The association that was asked for.
         association: &'static str,
     },
+    /// A link scorer that reads other embeddings than there are.
+    #[error(
+        "model {name:?} reads embeddings of {expected} numbers, and there are {}: \
+         set --reid (models.reid) or --features to what it was trained with, or --link to another network",
+        width.map_or("none".into(), |width| format!("some of {width}"))
+    )]
+    Embeddings {
+        /// Its name in the manifest.
+        name: String,
+        /// The width that it reads.
+        expected: usize,
+        /// The width that there is.
+        width: Option<usize>,
+    },
     /// No link scorer for an association that asks one.
     #[error("the association {association:?} needs a link scorer: set --link (models.link) to one")]
     NoLinker {

@@ -1,10 +1,11 @@
 //! The link scorer: histories of tracks and candidate detections to link probabilities.
 //!
-//! The graph takes `histories` f32 `[T, 6, 14]`, `lengths` i32 `[T]`, `candidates` f32 `[P, 20]` and
+//! The graph takes `histories` f32 `[T, 6, S]`, `lengths` i32 `[T]`, `candidates` f32 `[P, C]` and
 //! `pair_track` i64 `[P]` (which history a candidate belongs to) and gives `probability` f32 `[P]`.
-//! The file's metadata may hold what belongs to the network: the filter that it was trained with, as `filter`
-//! (the table of a tuning file), and an [`ExistenceHead`], trained on what the tracker makes of these very
-//! probabilities, as `existence`.
+//! The file's metadata may hold what belongs to the network: the [`Features`] that it reads, as `features`
+//! (S and C are their widths; [`Features::Relative`], 14 and 20, without), the filter that it was trained
+//! with, as `filter` (the table of a tuning file), and an [`ExistenceHead`], trained on what the tracker makes
+//! of these very probabilities, as `existence`.
 //!
 //! Requests of several cameras are joined by concatenation; `pair_track` moves by the tracks before it.
 
@@ -19,9 +20,7 @@ use super::graph::check_type;
 use super::manifest::{Family, ModelEntry};
 use super::runtime::Runtime;
 use super::{Arrangement, BatchModel, Batcher, InferError, Observer, Task};
-use crate::track::{
-    Association, CANDIDATE_FEATURES, ExistenceHead, HISTORY, LinkRequest, STEP_FEATURES, TrackerConfig,
-};
+use crate::track::{Association, ExistenceHead, Features, HISTORY, LinkRequest, TrackerConfig};
 use crate::tuning::FilterTuning;
 
 const MODEL: &str = Task::Link.as_str();
@@ -32,6 +31,8 @@ const INPUTS: [(&str, TensorElementType); 4] = [
     ("pair_track", TensorElementType::Int64),
 ];
 const OUTPUT: &str = "probability";
+/// Metadata that names the features.
+const FEATURES: &str = "features";
 /// Metadata that holds the existence head.
 const EXISTENCE: &str = "existence";
 /// Metadata that holds the filter.
@@ -40,6 +41,7 @@ const FILTER: &str = "filter";
 /// What a network's file says of the tracker around it.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Surroundings {
+    features: Features,
     existence: Option<Arc<ExistenceHead>>,
     filter: FilterTuning,
 }
@@ -47,16 +49,19 @@ pub(super) struct Surroundings {
 impl Surroundings {
     fn read(session: &Session) -> Result<Self, String> {
         let metadata = session.metadata().map_err(|e| format!("its metadata cannot be read: {e}"))?;
+        let features = metadata.custom(FEATURES).map(|text| text.parse()).transpose();
         let existence = metadata.custom(EXISTENCE).map(|text| text.parse()).transpose();
         let filter = metadata.custom(FILTER).map(|text| FilterTuning::parse(&text)).transpose();
         Ok(Self {
+            features: features.map_err(|e| format!("its features are unknown: {e}"))?.unwrap_or_default(),
             existence: existence.map_err(|e| format!("its existence head is broken: {e}"))?.map(Arc::new),
             filter: filter.map_err(|e| format!("its filter is broken: {e}"))?.unwrap_or_default(),
         })
     }
 
-    /// `tracker` with the network's filter and existence head, where it has them.
+    /// `tracker` with the network's features, and its filter and existence head where it has them.
     pub(super) fn calibrate(&self, mut tracker: TrackerConfig) -> TrackerConfig {
+        tracker.association.features = self.features;
         tracker.filter = self.filter.apply(tracker.filter);
         tracker.existence.head = self.existence.clone();
         tracker
@@ -87,7 +92,7 @@ impl Linker {
         let batcher = Batcher::start(MODEL, arrangement, observer, move |_| {
             let mut model = LinkModel::load(&runtime, &name, &file)?;
             found.get_or_init(|| model.surroundings.clone());
-            model.run(&[warm_up()])?;
+            model.run(&[warm_up(model.surroundings.features)])?;
             Ok(model)
         })?;
         Ok(Self {
@@ -98,7 +103,13 @@ impl Linker {
         })
     }
 
-    /// `tracker` with the filter and the existence head that the model's file carries, if it does.
+    /// What it reads.
+    pub fn features(&self) -> Features {
+        self.surroundings.features
+    }
+
+    /// `tracker` with the features that the model reads, and the filter and the existence head that its file
+    /// carries, if it does.
     pub fn calibrate(&self, tracker: TrackerConfig) -> TrackerConfig {
         self.surroundings.calibrate(tracker)
     }
@@ -119,13 +130,27 @@ impl Linker {
         Err(InferError::Association { name: self.name.to_string(), association: association.as_str() })
     }
 
+    /// Whether embeddings of `width` numbers, or none at all, are what it reads. A network that takes any
+    /// or needs none is content.
+    ///
+    /// # Errors
+    /// [`InferError::Embeddings`]: it was trained on others.
+    pub fn check_embeddings(&self, width: Option<usize>) -> Result<(), InferError> {
+        match self.features().embedding() {
+            Some(expected) if Some(expected) != width => {
+                Err(InferError::Embeddings { name: self.name.to_string(), expected, width })
+            }
+            _ => Ok(()),
+        }
+    }
+
     /// The probabilities of a request's pairs, in their order, each in `[0, 1]`. An empty request is
     /// answered at once.
     ///
     /// # Errors
     /// [`InferError::Request`] when the request's parts do not fit each other, or the model's failure.
     pub async fn score(&self, request: LinkRequest) -> Result<Vec<f32>, InferError> {
-        check(&request)?;
+        check(&request, self.features())?;
         if request.is_empty() {
             return Ok(vec![]);
         }
@@ -152,11 +177,13 @@ impl Linker {
 }
 
 /// What the graph relies on: ONNX Runtime would read past a tensor or stop the process.
-pub(super) fn check(request: &LinkRequest) -> Result<(), InferError> {
+fn check(request: &LinkRequest, features: Features) -> Result<(), InferError> {
     let (tracks, pairs) = (request.tracks(), request.pairs.len());
-    let reason = if request.histories.len() != tracks * HISTORY * STEP_FEATURES {
+    let reason = if !request.is_empty() && request.features != features {
+        format!("{} features for a network that reads {features} ones", request.features)
+    } else if request.histories.len() != tracks * HISTORY * features.step() {
         format!("{} history values for {tracks} tracks", request.histories.len())
-    } else if request.candidates.len() != pairs * CANDIDATE_FEATURES {
+    } else if request.candidates.len() != pairs * features.candidate() {
         format!("{} candidate values for {pairs} pairs", request.candidates.len())
     } else if let Some(pair) = request.pairs.iter().find(|pair| pair.track as usize >= tracks) {
         format!("a pair of track {} among {tracks} tracks", pair.track)
@@ -168,11 +195,12 @@ pub(super) fn check(request: &LinkRequest) -> Result<(), InferError> {
     Err(InferError::Request { model: MODEL, reason })
 }
 
-fn warm_up() -> LinkRequest {
+fn warm_up(features: Features) -> LinkRequest {
     LinkRequest {
-        histories: vec![0.0; HISTORY * STEP_FEATURES],
+        features,
+        histories: vec![0.0; HISTORY * features.step()],
         lengths: vec![1],
-        candidates: vec![0.0; CANDIDATE_FEATURES],
+        candidates: vec![0.0; features.candidate()],
         pairs: vec![crate::track::Pair { track: 0, detection: 0 }],
     }
 }
@@ -207,6 +235,16 @@ impl LinkModel {
         let outlet = outlet.ok_or_else(|| wrong(format!("it has no output {OUTPUT:?}")))?;
         check_type("output", outlet, TensorElementType::Float32).map_err(wrong)?;
         let surroundings = Surroundings::read(&session).map_err(wrong)?;
+        let features = surroundings.features;
+        for (input, width) in [("histories", features.step()), ("candidates", features.candidate())] {
+            let outlet = session.inputs().iter().find(|outlet| outlet.name() == input);
+            let found = outlet.and_then(|o| o.dtype().tensor_shape()).and_then(|shape| shape.last().copied());
+            if let Some(found) = found.filter(|found| *found >= 0 && *found as usize != width) {
+                let reason =
+                    format!("input {input:?} is {found} wide, its features ({features}) are {width}");
+                return Err(wrong(reason));
+            }
+        }
         Ok(Self {
             session,
             surroundings,
@@ -216,14 +254,20 @@ impl LinkModel {
         })
     }
 
+    /// What [`Linker::score`] checks.
+    pub(super) fn check(&self, request: &LinkRequest) -> Result<(), InferError> {
+        check(request, self.surroundings.features)
+    }
+
     /// Runs the joined request; `None` when ONNX Runtime gives fewer or more probabilities than pairs.
     fn probabilities(&mut self) -> ort::Result<Option<Vec<f32>>> {
         let (tracks, pairs) = (self.joined.tracks(), self.pair_track.len());
         let joined = &self.joined;
+        let [step, candidate] = [self.surroundings.features.step(), self.surroundings.features.candidate()];
         let outputs = self.session.run(ort::inputs![
-            "histories" => TensorRef::from_array_view(([tracks, HISTORY, STEP_FEATURES], &joined.histories[..]))?,
+            "histories" => TensorRef::from_array_view(([tracks, HISTORY, step], &joined.histories[..]))?,
             "lengths" => TensorRef::from_array_view(([tracks], &joined.lengths[..]))?,
-            "candidates" => TensorRef::from_array_view(([pairs, CANDIDATE_FEATURES], &joined.candidates[..]))?,
+            "candidates" => TensorRef::from_array_view(([pairs, candidate], &joined.candidates[..]))?,
             "pair_track" => TensorRef::from_array_view(([pairs], &self.pair_track[..]))?,
         ])?;
         let (_, values) = outputs[OUTPUT].try_extract_tensor::<f32>()?;
@@ -286,10 +330,12 @@ mod tests {
     /// A request of `tracks` histories and a pair of each `(track)` of `pairs`.
     fn request(seed: usize, tracks: usize, pairs: &[u32]) -> LinkRequest {
         let pattern = |n: usize| (0..n).map(|i| ((i + seed) % 11) as f32 / 10.0 - 0.5).collect();
+        let features = Features::Relative;
         LinkRequest {
-            histories: pattern(tracks * HISTORY * STEP_FEATURES),
+            features,
+            histories: pattern(tracks * HISTORY * features.step()),
             lengths: (0..tracks).map(|track| ((track + seed) % HISTORY + 1) as i32).collect(),
-            candidates: pattern(pairs.len() * CANDIDATE_FEATURES),
+            candidates: pattern(pairs.len() * features.candidate()),
             pairs: pairs.iter().map(|&track| Pair { track, detection: 0 }).collect(),
         }
     }

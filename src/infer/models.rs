@@ -155,13 +155,17 @@ impl Models {
         }
     }
 
-    /// Checks that the link scorer is one that `association` can use, if it asks one.
+    /// Checks that the link scorer is one that `association` can use with these embeddings, if it asks one.
     ///
     /// # Errors
-    /// [`InferError::NoLinker`] or [`InferError::Association`].
+    /// [`InferError::NoLinker`], [`InferError::Association`] or [`InferError::Embeddings`].
     pub fn check_suits(&self, association: Association) -> Result<(), InferError> {
         match &self.linker {
-            Some(linker) => linker.check_suits(association),
+            Some(linker) if association.asks_scorer() => {
+                linker.check_suits(association)?;
+                linker.check_embeddings(self.embedder.as_ref().map(Embedder::width))
+            }
+            Some(_) => Ok(()),
             None if association.asks_scorer() => {
                 Err(InferError::NoLinker { association: association.as_str() })
             }

@@ -2,6 +2,8 @@
 
 use std::fmt::Write as _;
 
+use crate::track::Features;
+
 /// Facts of a training run.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Card {
@@ -13,6 +15,8 @@ pub struct Card {
     pub licence: String,
     /// Whether it gives the weights of explicit features instead of the probability itself.
     pub explicit: bool,
+    /// What it reads.
+    pub features: Features,
     /// Width of the hidden state.
     pub hidden: usize,
     /// Number of parameters.
@@ -67,34 +71,49 @@ impl Card {
     /// The card as Markdown.
     pub fn markdown(&self) -> String {
         let mut out = String::new();
+        let sees = match self.features {
+            Features::Relative => "Boxes only: it sees neither pixels nor the place in the picture.".into(),
+            Features::Appearance => {
+                "Boxes, not their place in the picture, and how alike embeddings are: it \
+                                     is good for embeddings of the kind that it was trained on."
+                    .into()
+            }
+            Features::Literal { embedding } => {
+                format!("Boxes with their place in the picture and embeddings of {embedding} numbers.")
+            }
+        };
         let _ = write!(
             out,
             "# {}: link network\n\n\
              Says how probable it is that a detection continues a track, from up to 6 observations of the \
              track and the detection. A GRU of {} units, the reset gate before the matrix product{}, {} \
-             parameters, {} bytes of ONNX. Boxes only: it sees neither pixels nor the place in the picture. \
+             parameters, {} bytes of ONNX. {} \
              Written by `gakp train`.\n\n\
              ## Licence of the data\n{}\n\n\
              ## Input and output\n\
              | | name | type |\n| --- | --- | --- |\n\
-             | in | `histories` | f32 `[T, 6, 14]`, observations packed from index 0, oldest first |\n\
+             | in | `histories` | f32 `[T, 6, {}]`, observations packed from index 0, oldest first |\n\
              | in | `lengths` | i32 `[T]`, 1 to 6 |\n\
-             | in | `candidates` | f32 `[P, 20]` |\n\
+             | in | `candidates` | f32 `[P, {}]` |\n\
              | in | `pair_track` | i64 `[P]`, row of `histories` |\n\
              | out | `probability` | f32 `[P]` |\n\n\
-             The features are those of `src/track/features.rs`, raw: normalisation is in the graph. T and P \
+             The features are those of `src/track/features/{}.rs`, raw: normalisation is in the graph. T and P \
              must be at least 1.\n\n",
             self.file,
             self.hidden,
             if self.explicit {
-                ", over the track alone: it gives the weights of four explicit features of the pair, and the \
+                ", over the track alone: it gives the weights of explicit features of the pair, and the \
                  probability is the logistic function of their weighted sum"
             } else {
                 ""
             },
             self.parameters,
             self.bytes,
-            self.licence
+            sees,
+            self.licence,
+            self.features.step(),
+            self.features.candidate(),
+            self.features.name()
         );
         let _ =
             writeln!(out, "## Data\nSequences ({}): {}.", self.sequences.len(), self.sequences.join(", "));

@@ -4,9 +4,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 pub use crate::mot::footage as group;
-use crate::mot::{Row, RowError, SeqInfoError, Sequence, SequenceInfo, parse_truth};
+use crate::mot::{
+    FeatureError, Row, RowError, SeqInfoError, Sequence, SequenceEmbeddings, SequenceInfo, parse_truth,
+};
 use crate::track::assign::assign;
-use crate::types::{BBox, Detection, MediaTime};
+use crate::types::{BBox, Detection, Embedding, MediaTime};
 
 /// Least IoU of a detection with the truth that it belongs to.
 const MATCH_IOU: f64 = 0.5;
@@ -40,6 +42,8 @@ pub struct LabelledFrame {
     pub detections: Vec<Detection>,
     /// Whose each detection is.
     pub owners: Vec<Owner>,
+    /// What each detection looks like; empty where nothing is known of that.
+    pub embeddings: Vec<Option<Embedding>>,
 }
 
 /// A sequence whose detections are joined to the truth.
@@ -85,6 +89,14 @@ pub enum DatasetError {
         path: PathBuf,
         /// What is wrong.
         source: SeqInfoError,
+    },
+    /// Appearance vectors that do not fit.
+    #[error("{}: {source}", path.display())]
+    Features {
+        /// Which.
+        path: PathBuf,
+        /// What is wrong.
+        source: FeatureError,
     },
     /// A folder without sequences.
     #[error(
@@ -137,6 +149,30 @@ pub fn load(folder: &Path) -> Result<LabelledSequence, DatasetError> {
     Ok(join(name, sequence, &truth))
 }
 
+/// Gives `sequence`, which [`load`] read from `folder`, its appearance vectors, det/det_features.npy.
+///
+/// # Errors
+/// A file that cannot be read or does not fit the detections.
+pub fn load_embeddings(folder: &Path, sequence: &mut LabelledSequence) -> Result<(), DatasetError> {
+    let path = folder.join("det/det_features.npy");
+    let bytes = fs::read(&path).map_err(|source| DatasetError::Read { path: path.clone(), source })?;
+    let det = folder.join("det/det.txt");
+    let rows = fs::read_to_string(&det).map_err(|source| DatasetError::Read { path: det, source })?;
+    let info = SequenceInfo {
+        name: sequence.name.clone(),
+        frame_rate: sequence.frame_rate,
+        length: sequence.frames.len() as u32,
+        width: sequence.width as u32,
+        height: sequence.height as u32,
+    };
+    let found = SequenceEmbeddings::parse(&bytes, &rows, &info)
+        .map_err(|source| DatasetError::Features { path, source })?;
+    for (index, frame) in sequence.frames.iter_mut().enumerate() {
+        frame.embeddings = found.frame(index).to_vec();
+    }
+    Ok(())
+}
+
 /// Joins the detections of `sequence` to `truth`, frame by frame.
 pub fn join(name: String, sequence: Sequence, truth: &[Row]) -> LabelledSequence {
     let Sequence { info, detections } = sequence;
@@ -158,6 +194,7 @@ pub fn join(name: String, sequence: Sequence, truth: &[Row]) -> LabelledSequence
             time: MediaTime::from_secs(index as f64 / info.frame_rate),
             owners: owners(&detections, &people),
             detections,
+            embeddings: vec![],
         })
         .collect();
     LabelledSequence {
@@ -210,8 +247,9 @@ impl Variant {
 pub fn vary(sequence: &LabelledSequence, variant: &Variant, rng: &mut fastrand::Rng) -> LabelledSequence {
     let mut copy = LabelledSequence { frames: vec![], ..sequence.clone() };
     for frame in sequence.frames.iter().step_by(variant.stride.max(1)) {
-        let mut kept = LabelledFrame { detections: vec![], owners: vec![], ..*frame };
-        for (detection, owner) in frame.detections.iter().zip(&frame.owners) {
+        let mut kept =
+            LabelledFrame { time: frame.time, detections: vec![], owners: vec![], embeddings: vec![] };
+        for (index, (detection, owner)) in frame.detections.iter().zip(&frame.owners).enumerate() {
             if rng.f64() < variant.dropout {
                 continue;
             }
@@ -226,6 +264,7 @@ pub fn vary(sequence: &LabelledSequence, variant: &Variant, rng: &mut fastrand::
             detection.bbox = BBox::from_center(cx, b.cy() + noise() * b.h, w, h);
             kept.detections.push(detection);
             kept.owners.push(*owner);
+            kept.embeddings.extend(frame.embeddings.get(index).cloned());
         }
         copy.frames.push(kept);
     }
@@ -274,6 +313,7 @@ mod tests {
                 time: MediaTime::from_secs(f64::from(i) / 8.0),
                 detections: vec![Detection::person(BBox::new(f64::from(i), 8.0, 16.0, 32.0), 0.5)],
                 owners: vec![Owner::Of(1)],
+                embeddings: vec![],
             })
             .collect();
         let sequence = LabelledSequence {

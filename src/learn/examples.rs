@@ -4,13 +4,14 @@ use std::ops::Range;
 
 use sha2::{Digest, Sha256};
 
-use crate::track::{CANDIDATE_FEATURES, HISTORY, LinkRequest, STEP_FEATURES};
+use crate::track::{Features, HISTORY, LinkRequest};
 
 /// A growing set of labelled pairs with raw features.
 ///
 /// Histories are stored once a track and frame, as in [`LinkRequest`]; examples refer to them.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Examples {
+    features: Features,
     histories: Vec<f32>,
     lengths: Vec<u8>,
     candidates: Vec<f32>,
@@ -39,7 +40,7 @@ impl Split {
     /// A SHA-256 of all that is in it.
     pub fn fingerprint(&self) -> [u8; 32] {
         let mut hash = Sha256::new();
-        for Examples { histories, lengths, candidates, track, labels, weights } in
+        for Examples { features: _, histories, lengths, candidates, track, labels, weights } in
             [&self.training, &self.validation]
         {
             for values in [histories, candidates, labels, weights] {
@@ -54,6 +55,16 @@ impl Split {
 }
 
 impl Examples {
+    /// None yet, of `features`.
+    pub fn of(features: Features) -> Self {
+        Self { features, ..Self::default() }
+    }
+
+    /// What the rows are.
+    pub fn features(&self) -> Features {
+        self.features
+    }
+
     /// Number of examples.
     pub fn len(&self) -> usize {
         self.labels.len()
@@ -71,19 +82,23 @@ impl Examples {
 
     /// Adds the pairs of `request` that `judge` wants: for each pair index `Some((label, weight))`
     /// to take it, `None` to leave it. Only the histories that are needed are copied.
+    ///
+    /// # Panics
+    /// When the request has other features.
     pub fn push(&mut self, request: &LinkRequest, mut judge: impl FnMut(usize) -> Option<(bool, f32)>) {
+        assert_eq!(request.features, self.features, "one kind of rows");
         let mut stored: Vec<Option<u32>> = vec![None; request.tracks()];
         for (i, pair) in request.pairs.iter().enumerate() {
             let Some((label, weight)) = judge(i) else { continue };
             let row = pair.track as usize;
             let track = *stored[row].get_or_insert_with(|| {
-                let width = HISTORY * STEP_FEATURES;
+                let width = HISTORY * self.features.step();
                 self.histories.extend_from_slice(&request.histories[row * width..(row + 1) * width]);
                 self.lengths.push(request.lengths[row].clamp(1, HISTORY as i32) as u8);
                 (self.lengths.len() - 1) as u32
             });
             self.track.push(track);
-            let width = CANDIDATE_FEATURES;
+            let width = self.features.candidate();
             self.candidates.extend_from_slice(&request.candidates[i * width..(i + 1) * width]);
             self.labels.push(if label { 1.0 } else { 0.0 });
             self.weights.push(weight);
@@ -91,7 +106,11 @@ impl Examples {
     }
 
     /// Appends all of `other`.
+    ///
+    /// # Panics
+    /// When it has other features.
     pub fn append(&mut self, other: &Examples) {
+        assert_eq!(other.features, self.features, "one kind of rows");
         let first = self.lengths.len() as u32;
         self.histories.extend_from_slice(&other.histories);
         self.lengths.extend_from_slice(&other.lengths);
@@ -106,7 +125,7 @@ impl Examples {
     /// # Panics
     /// When `range` is beyond the examples.
     pub fn choose(&self, range: Range<usize>, count: usize, rng: &mut fastrand::Rng) -> Examples {
-        let mut chosen = Examples::default();
+        let mut chosen = Examples::of(self.features);
         let mut moved: Vec<Option<u32>> = vec![None; self.lengths.len()];
         let mut wanted = count.min(range.len());
         for i in range.clone() {
@@ -117,7 +136,7 @@ impl Examples {
             wanted -= 1;
             let track = self.track[i] as usize;
             let to = *moved[track].get_or_insert_with(|| {
-                let width = HISTORY * STEP_FEATURES;
+                let width = HISTORY * self.features.step();
                 let rows = &self.histories[track * width..(track + 1) * width];
                 chosen.histories.extend_from_slice(rows);
                 chosen.lengths.push(self.lengths[track]);
@@ -131,12 +150,13 @@ impl Examples {
         chosen
     }
 
-    /// History rows `[length, STEP_FEATURES]` and candidate `[CANDIDATE_FEATURES]` of example `i`.
+    /// History rows, as many as it has observations, and candidate row of example `i`.
     pub fn sequence(&self, i: u32) -> (&[f32], &[f32]) {
         let (i, track) = (i as usize, self.track[i as usize] as usize);
-        let start = track * HISTORY * STEP_FEATURES;
-        let history = &self.histories[start..start + usize::from(self.lengths[track]) * STEP_FEATURES];
-        (history, &self.candidates[i * CANDIDATE_FEATURES..(i + 1) * CANDIDATE_FEATURES])
+        let [step, candidate] = [self.features.step(), self.features.candidate()];
+        let start = track * HISTORY * step;
+        let history = &self.histories[start..start + usize::from(self.lengths[track]) * step];
+        (history, &self.candidates[i * candidate..(i + 1) * candidate])
     }
 
     /// (label, weight) of example `i`.
@@ -154,16 +174,16 @@ impl Examples {
         &self.weights
     }
 
-    /// Valid history steps of all stored tracks, `STEP_FEATURES` wide each.
+    /// Valid history steps of all stored tracks.
     pub fn history_steps(&self) -> impl Iterator<Item = &[f32]> {
-        self.histories.chunks_exact(HISTORY * STEP_FEATURES).zip(&self.lengths).flat_map(|(rows, length)| {
-            rows[..usize::from(*length) * STEP_FEATURES].chunks_exact(STEP_FEATURES)
-        })
+        let width = self.features.step();
+        let tracks = self.histories.chunks_exact(HISTORY * width).zip(&self.lengths);
+        tracks.flat_map(move |(rows, length)| rows[..usize::from(*length) * width].chunks_exact(width))
     }
 
-    /// Candidates of all examples, `CANDIDATE_FEATURES` wide each.
+    /// Candidates of all examples.
     pub fn candidates(&self) -> impl Iterator<Item = &[f32]> {
-        self.candidates.chunks_exact(CANDIDATE_FEATURES)
+        self.candidates.chunks_exact(self.features.candidate())
     }
 
     /// Applies `history` to every valid history step and `candidate` to every candidate, in place.
@@ -172,11 +192,10 @@ impl Examples {
         mut history: impl FnMut(&mut [f32]),
         mut candidate: impl FnMut(&mut [f32]),
     ) {
-        for (rows, length) in self.histories.chunks_exact_mut(HISTORY * STEP_FEATURES).zip(&self.lengths) {
-            rows[..usize::from(*length) * STEP_FEATURES]
-                .chunks_exact_mut(STEP_FEATURES)
-                .for_each(&mut history);
+        let width = self.features.step();
+        for (rows, length) in self.histories.chunks_exact_mut(HISTORY * width).zip(&self.lengths) {
+            rows[..usize::from(*length) * width].chunks_exact_mut(width).for_each(&mut history);
         }
-        self.candidates.chunks_exact_mut(CANDIDATE_FEATURES).for_each(&mut candidate);
+        self.candidates.chunks_exact_mut(self.features.candidate()).for_each(&mut candidate);
     }
 }

@@ -7,7 +7,7 @@
 
 use super::activate::sigmoid;
 use super::adam::{Adam, Schedule};
-use super::dataset::LabelledSequence;
+use super::dataset::{LabelledFrame, LabelledSequence};
 use crate::mot::Row;
 use crate::track::existence::Scene;
 use crate::track::{
@@ -71,8 +71,8 @@ impl Boxes {
         let mut tracker = Tracker::new(config.clone());
         let mut request = LinkRequest::default();
         for ((frame, people), neutral) in sequence.frames.iter().zip(&people).zip(&neutral) {
-            let detections = &frame.detections;
-            let input = FrameInput { time: frame.time, width, height, detections, embeddings: &[] };
+            let LabelledFrame { time, detections, embeddings, .. } = frame;
+            let input = FrameInput { time: *time, width, height, detections, embeddings };
             tracker.predict(input, &mut request);
             let links = if request.is_empty() { vec![] } else { score(&request) };
             if tracker.update(&links).is_err() {

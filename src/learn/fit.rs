@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::adam::Adam;
 use super::descent::{Trainee, descend};
 use super::examples::{Examples, Split};
-use super::gru::{Batch, Gru, GruShape, Tape};
+use super::gru::{Batch, Gru, Tape};
 use super::model::LinkModel;
 
 /// How to train.
@@ -106,7 +106,7 @@ impl Trainee for Gru {
         (batch, tape): &mut Self::Scratch,
         gradient: &mut [f32],
     ) -> f64 {
-        batch.gather(chosen, |i| examples.sequence(i));
+        batch.gather(self.shape.features, chosen, |i| examples.sequence(i));
         Gru::loss(self, batch, tape, |i| examples.target(i), scale, gradient)
     }
 }
@@ -125,7 +125,7 @@ pub fn fit(
 ) -> (LinkModel, Vec<Epoch>) {
     settings.check(examples);
     let mut rng = fastrand::Rng::with_seed(settings.seed);
-    let mut model = LinkModel::random(GruShape { hidden: settings.hidden }, &examples.training, &mut rng);
+    let mut model = LinkModel::random(settings.hidden, &examples.training, &mut rng);
     let inputs = Split {
         training: model.normalise(&examples.training),
         validation: model.normalise(&examples.validation),
@@ -148,7 +148,7 @@ pub fn logits(model: &LinkModel, examples: &Examples) -> Vec<f32> {
     let (mut batch, mut tape) = (Batch::default(), Tape::default());
     let all: Vec<u32> = (0..inputs.len() as u32).collect();
     for chosen in all.chunks(1024) {
-        batch.gather(chosen, |i| inputs.sequence(i));
+        batch.gather(model.features(), chosen, |i| inputs.sequence(i));
         model.gru.forward(&batch, &mut tape);
         for (i, logit) in batch.order().iter().zip(tape.logits()) {
             found[*i as usize] = *logit;

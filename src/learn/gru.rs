@@ -14,21 +14,20 @@ use std::ops::Range;
 
 use super::activate::{sigmoid, sigmoid_all, tanh_all};
 use super::gemm::{View, gemm};
-use crate::track::{CANDIDATE_FEATURES, HISTORY, STEP_FEATURES};
+use crate::track::{Features, HISTORY};
 
 /// Steps of a sequence: the history, then the candidate.
 const STEPS: usize = HISTORY + 1;
 
-/// Rows of the input matrix: those of a history step, then those of the candidate.
-const INPUT_ROWS: usize = STEP_FEATURES + CANDIDATE_FEATURES;
-
 /// Sizes of a [`Gru`] and where its parts lie in the parameter vector.
 ///
-/// The parts, in order, row-major: `W` history `[STEP_FEATURES, 3 H]`, `W` candidate
-/// `[CANDIDATE_FEATURES, 3 H]`, `U [H, 3 H]`, `b [3 H]`, `v [H]`, `v0 [1]`; the columns of a gate
-/// block are `r`, `z`, `c`.
+/// The parts, in order, row-major, for observations of `S` values and candidates of `C`: `W` history
+/// `[S, 3 H]`, `W` candidate `[C, 3 H]`, `U [H, 3 H]`, `b [3 H]`, `v [H]`, `v0 [1]`; the columns of a gate
+/// block are `r`, `z`, `c`. [`Features::Literal`] has one `W` for all steps, as the paper has it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct GruShape {
+    /// What it reads.
+    pub features: Features,
     /// Width of the hidden state.
     pub hidden: usize,
 }
@@ -38,14 +37,20 @@ impl GruShape {
         3 * self.hidden
     }
 
+    /// Whether history and candidate are multiplied by the same `W`.
+    pub fn shares_w(self) -> bool {
+        matches!(self.features, Features::Literal { .. })
+    }
+
     /// `W` of a history step.
     pub fn w_history(self) -> Range<usize> {
-        0..STEP_FEATURES * self.gates()
+        0..self.features.step() * self.gates()
     }
 
     /// `W` of the candidate.
     pub fn w_candidate(self) -> Range<usize> {
-        self.w_history().end..INPUT_ROWS * self.gates()
+        let start = if self.shares_w() { 0 } else { self.w_history().end };
+        start..start + self.features.candidate() * self.gates()
     }
 
     /// `U`.
@@ -89,9 +94,9 @@ pub struct Gru {
 /// Sequences of one gradient step, the longest history first.
 #[derive(Clone, Debug, Default)]
 pub struct Batch {
-    /// `[sum of rows per step, STEP_FEATURES]`: for each step all sequences that have begun.
+    /// `[sum of rows per step, S]`: for each step all sequences that have begun.
     x_history: Vec<f32>,
-    /// `[sequences, CANDIDATE_FEATURES]`.
+    /// `[sequences, C]`.
     x_candidate: Vec<f32>,
     /// First row of each step in the concatenation over steps, and the end.
     rows: [usize; STEPS + 1],
@@ -101,26 +106,32 @@ pub struct Batch {
 
 impl Batch {
     /// Takes sequences, given as (history rows, candidate) by `get` for each of `chosen`; a history
-    /// is `[length, STEP_FEATURES]`, length `1..=HISTORY`.
+    /// is `[length, S]`, length `1..=HISTORY`, `S` the width that `features` give it.
     ///
     /// Sequences end together and begin when their history does. Sorted by length, those that have
     /// begun are the first rows of every step: nothing is masked, nothing computed in vain.
-    pub fn gather<'a>(&mut self, chosen: &[u32], get: impl Fn(u32) -> (&'a [f32], &'a [f32])) {
+    pub fn gather<'a>(
+        &mut self,
+        features: Features,
+        chosen: &[u32],
+        get: impl Fn(u32) -> (&'a [f32], &'a [f32]),
+    ) {
+        let width = features.step();
         self.order.clear();
         self.order.extend_from_slice(chosen);
         self.order.sort_by_key(|i| std::cmp::Reverse(get(*i).0.len()));
         self.x_history.clear();
         self.x_candidate.clear();
         for step in 0..HISTORY {
-            self.rows[step] = self.x_history.len() / STEP_FEATURES;
+            self.rows[step] = self.x_history.len() / width;
             for i in &self.order {
                 let (history, _) = get(*i);
-                let length = history.len() / STEP_FEATURES;
+                let length = history.len() / width;
                 let Some(at) = (step + length).checked_sub(HISTORY) else { break };
-                self.x_history.extend_from_slice(&history[at * STEP_FEATURES..(at + 1) * STEP_FEATURES]);
+                self.x_history.extend_from_slice(&history[at * width..(at + 1) * width]);
             }
         }
-        self.rows[HISTORY] = self.x_history.len() / STEP_FEATURES;
+        self.rows[HISTORY] = self.x_history.len() / width;
         self.rows[STEPS] = self.rows[HISTORY] + self.order.len();
         for i in &self.order {
             self.x_candidate.extend_from_slice(get(*i).1);
@@ -167,8 +178,10 @@ impl Gru {
             theta[range].iter_mut().for_each(|v| *v = (rng.f32() * 2.0 - 1.0) * bound);
         };
         let state = 1.0 / (shape.hidden as f32).sqrt();
-        fill(shape.w_history(), (1.0 / STEP_FEATURES as f32).sqrt());
-        fill(shape.w_candidate(), (1.0 / CANDIDATE_FEATURES as f32).sqrt());
+        fill(shape.w_history(), (1.0 / shape.features.step() as f32).sqrt());
+        if !shape.shares_w() {
+            fill(shape.w_candidate(), (1.0 / shape.features.candidate() as f32).sqrt());
+        }
         fill(shape.u(), state);
         fill(shape.v(), state);
         Self { shape, theta }
@@ -182,6 +195,7 @@ impl Gru {
     /// Logits of every sequence of `batch` into `tape`.
     pub fn forward(&self, batch: &Batch, tape: &mut Tape) {
         let (shape, h, g) = (self.shape, self.shape.hidden, self.shape.gates());
+        let [step_width, candidate_width] = [shape.features.step(), shape.features.candidate()];
         let sequences = batch.order.len();
         let [history, total] = [batch.rows[HISTORY], batch.rows[STEPS]];
         tape.gates.clear();
@@ -193,14 +207,11 @@ impl Gru {
 
         // The inputs of all steps at once; only the state is sequential.
         let (of_history, of_candidate) = tape.gates.split_at_mut(history * g);
+        let (x, w) = (View::rows(&batch.x_history, step_width), View::rows(self.part(shape.w_history()), g));
+        gemm((history, step_width, g), x, w, 1.0, of_history, g);
         let (x, w) =
-            (View::rows(&batch.x_history, STEP_FEATURES), View::rows(self.part(shape.w_history()), g));
-        gemm((history, STEP_FEATURES, g), x, w, 1.0, of_history, g);
-        let (x, w) = (
-            View::rows(&batch.x_candidate, CANDIDATE_FEATURES),
-            View::rows(self.part(shape.w_candidate()), g),
-        );
-        gemm((sequences, CANDIDATE_FEATURES, g), x, w, 1.0, of_candidate, g);
+            (View::rows(&batch.x_candidate, candidate_width), View::rows(self.part(shape.w_candidate()), g));
+        gemm((sequences, candidate_width, g), x, w, 1.0, of_candidate, g);
 
         let u = self.part(shape.u());
         for step in 0..STEPS {
@@ -257,6 +268,7 @@ impl Gru {
         assert_eq!(d_logits.len(), batch.order.len(), "one derivative a sequence");
         assert_eq!(gradient.len(), shape.parameters(), "one gradient a parameter");
         let [history, total] = [batch.rows[HISTORY], batch.rows[STEPS]];
+        let [step_width, candidate_width] = [shape.features.step(), shape.features.candidate()];
         let sequences = batch.order.len();
         tape.d_gates.resize(total * g, 0.0);
         tape.d_reset.resize(sequences * h, 0.0);
@@ -313,18 +325,18 @@ impl Gru {
 
         let d_gates = &tape.d_gates[..total * g];
         let (of_history, of_candidate) = d_gates.split_at(history * g);
-        let x = View::transposed(&batch.x_history, STEP_FEATURES);
+        let x = View::transposed(&batch.x_history, step_width);
         gemm(
-            (STEP_FEATURES, history, g),
+            (step_width, history, g),
             x,
             View::rows(of_history, g),
             1.0,
             &mut gradient[shape.w_history()],
             g,
         );
-        let x = View::transposed(&batch.x_candidate, CANDIDATE_FEATURES);
+        let x = View::transposed(&batch.x_candidate, candidate_width);
         let d_w = &mut gradient[shape.w_candidate()];
-        gemm((CANDIDATE_FEATURES, sequences, g), x, View::rows(of_candidate, g), 1.0, d_w, g);
+        gemm((candidate_width, sequences, g), x, View::rows(of_candidate, g), 1.0, d_w, g);
         let d_u = &mut gradient[shape.u()];
         gemm((h, total, 2 * h), View::transposed(&tape.before, h), View::rows(d_gates, g), 1.0, d_u, g);
         if total > 0 {

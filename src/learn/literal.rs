@@ -4,7 +4,7 @@
 //! against each other.
 
 use super::model::{CLIP, LinkModel, Normaliser};
-use crate::track::{HISTORY, LinkRequest, STEP_FEATURES};
+use crate::track::{HISTORY, LinkRequest};
 
 fn sigmoid(x: f64) -> f64 {
     1.0 / (1.0 + (-x).exp())
@@ -47,9 +47,10 @@ pub fn logit(model: &LinkModel, theta: &[f64], history: &[Vec<f64>], candidate: 
 pub fn probability(model: &LinkModel, request: &LinkRequest, pair: usize) -> f64 {
     let theta: Vec<f64> = model.gru.theta.iter().map(|v| f64::from(*v)).collect();
     let track = request.pairs[pair].track as usize;
-    let rows = &request.histories[track * HISTORY * STEP_FEATURES..];
+    let width = model.history.mean.len();
+    let rows = &request.histories[track * HISTORY * width..];
     let history: Vec<Vec<f64>> = rows
-        .chunks_exact(STEP_FEATURES)
+        .chunks_exact(width)
         .take(request.lengths[track] as usize)
         .map(|row| normalised(&model.history, row))
         .collect();

@@ -2,7 +2,7 @@
 
 use super::examples::Examples;
 use super::gru::{Gru, GruShape};
-use crate::track::{CANDIDATE_FEATURES, STEP_FEATURES};
+use crate::track::Features;
 
 /// Normalised inputs are clipped at this many standard deviations.
 pub const CLIP: f32 = 6.0;
@@ -57,25 +57,39 @@ impl Normaliser {
 }
 
 /// A link model. History steps and candidates are normalised apart: an innovation of a matched
-/// observation is a tenth of a rival's, and on a common scale it would vanish.
+/// observation is a tenth of a rival's, and on a common scale it would vanish. Where both are
+/// multiplied by one `W` they are normalised together.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LinkModel {
-    /// Of the history's steps, `STEP_FEATURES` wide.
+    /// Of the history's steps.
     pub history: Normaliser,
-    /// Of the candidates, `CANDIDATE_FEATURES` wide.
+    /// Of the candidates.
     pub candidate: Normaliser,
     /// The network over normalised inputs.
     pub gru: Gru,
 }
 
 impl LinkModel {
-    /// A network of random parameters whose normalisers fit `examples`.
-    pub fn random(shape: GruShape, examples: &Examples, rng: &mut fastrand::Rng) -> Self {
-        Self {
-            history: Normaliser::measure(STEP_FEATURES, examples.history_steps()),
-            candidate: Normaliser::measure(CANDIDATE_FEATURES, examples.candidates()),
-            gru: Gru::random(shape, rng),
-        }
+    /// A network of random parameters whose normalisers fit `examples`; it reads what these are made of.
+    pub fn random(hidden: usize, examples: &Examples, rng: &mut fastrand::Rng) -> Self {
+        let features = examples.features();
+        let shape = GruShape { features, hidden };
+        let steps = || examples.history_steps();
+        let (history, candidate) = if shape.shares_w() {
+            let all = Normaliser::measure(features.step(), steps().chain(examples.candidates()));
+            (all.clone(), all)
+        } else {
+            (
+                Normaliser::measure(features.step(), steps()),
+                Normaliser::measure(features.candidate(), examples.candidates()),
+            )
+        };
+        Self { history, candidate, gru: Gru::random(shape, rng) }
+    }
+
+    /// What it reads.
+    pub fn features(&self) -> Features {
+        self.gru.shape.features
     }
 
     /// `examples` with normalised features.

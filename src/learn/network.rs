@@ -7,7 +7,7 @@ use super::{
     Checkpoint, Epoch, Examples, ExplicitModel, ExplicitScorer, Fit, GruScorer, LinkModel, Progress, Split,
     fit, fit_explicit, logits, logits_explicit, onnx,
 };
-use crate::track::{Association, LinkRequest};
+use crate::track::{Association, Features, LinkRequest};
 
 /// A trained network of either kind.
 #[derive(Clone, Debug, PartialEq)]
@@ -45,6 +45,14 @@ impl Network {
         match self {
             Network::Implicit(_) => Association::Implicit,
             Network::Explicit(_) => Association::Explicit,
+        }
+    }
+
+    /// What it reads.
+    pub fn features(&self) -> Features {
+        match self {
+            Network::Implicit(model) => model.features(),
+            Network::Explicit(model) => model.shape.features,
         }
     }
 

@@ -42,14 +42,15 @@ impl Recipe {
     /// Makes the examples; `tell` hears of every copy that is done.
     pub fn collect(&self, sequences: &[&LabelledSequence], mut tell: impl FnMut()) -> Split {
         let mut rng = fastrand::Rng::with_seed(self.seed);
-        let mut all = Split::default();
+        let features = self.teacher.features;
+        let mut all = Split { training: Examples::of(features), validation: Examples::of(features) };
         let copies = (sequences.len() * self.variants.len()).max(1);
         let wanted = self.examples.div_ceil(copies);
         let later = (wanted as f64 * self.validation).round() as usize;
         for sequence in sequences {
             for variant in &self.variants {
                 let copy = vary(sequence, variant, &mut rng);
-                let mut found = Examples::default();
+                let mut found = Examples::of(features);
                 self.teacher.collect(&copy, &mut rng, &mut found);
                 // Examples lie in the order of their frames.
                 let end = found.len() - (found.len() as f64 * self.validation).round() as usize;

@@ -3,14 +3,14 @@
 use super::activate::{sigmoid, sigmoid_all, tanh_all};
 use super::gemm::{View, gemm};
 use super::model::LinkModel;
-use crate::track::{CANDIDATE_FEATURES, HISTORY, LinkRequest, STEP_FEATURES};
+use crate::track::{HISTORY, LinkRequest};
 
 /// Scores link requests. Each track's history is encoded once, each candidate projected once; only
 /// the last step is pairwise.
 #[derive(Clone, Debug)]
 pub struct GruScorer {
     model: LinkModel,
-    /// Normalised histories `[T, HISTORY, STEP_FEATURES]`.
+    /// Normalised histories `[T, HISTORY, S]`.
     x: Vec<f32>,
     /// Input part of the gates.
     gates: Vec<f32>,
@@ -38,15 +38,19 @@ impl GruScorer {
     /// emptied first. An empty request gives none.
     ///
     /// # Panics
-    /// When the request's parts disagree in length or a pair names a track that is not there.
+    /// When the request's parts disagree in length, a pair names a track that is not there, or its features
+    /// are others than the model's.
     pub fn score(&mut self, request: &LinkRequest, probabilities: &mut Vec<f32>) {
         let (tracks, pairs) = (request.tracks(), request.pairs.len());
-        assert_eq!(request.histories.len(), tracks * HISTORY * STEP_FEATURES, "one history a track");
-        assert_eq!(request.candidates.len(), pairs * CANDIDATE_FEATURES, "one candidate a pair");
         probabilities.clear();
         if request.is_empty() {
             return;
         }
+        let features = self.model.features();
+        assert_eq!(request.features, features, "what the model reads");
+        assert_eq!(request.histories.len(), tracks * HISTORY * features.step(), "one history a track");
+        assert_eq!(request.candidates.len(), pairs * features.candidate(), "one candidate a pair");
+        let width = features.candidate();
         self.encode(request);
         let gru = &self.model.gru;
         let (shape, h, g) = (gru.shape, gru.shape.hidden, 3 * gru.shape.hidden);
@@ -63,11 +67,11 @@ impl GruScorer {
 
         self.x.clear();
         self.x.extend_from_slice(&request.candidates);
-        self.x.chunks_exact_mut(CANDIDATE_FEATURES).for_each(|row| self.model.candidate.apply(row));
+        self.x.chunks_exact_mut(width).for_each(|row| self.model.candidate.apply(row));
         self.gates.clear();
         (0..pairs).for_each(|_| self.gates.extend_from_slice(gru.part(shape.b())));
-        let (x, w) = (View::rows(&self.x, CANDIDATE_FEATURES), View::rows(gru.part(shape.w_candidate()), g));
-        gemm((pairs, CANDIDATE_FEATURES, g), x, w, 1.0, &mut self.gates, g);
+        let (x, w) = (View::rows(&self.x, width), View::rows(gru.part(shape.w_candidate()), g));
+        gemm((pairs, width, g), x, w, 1.0, &mut self.gates, g);
         self.reset.resize(pairs * h, 0.0);
         for ((gates, reset), pair) in
             self.gates.chunks_exact_mut(g).zip(self.reset.chunks_exact_mut(h)).zip(&request.pairs)
@@ -101,13 +105,14 @@ impl GruScorer {
         let (shape, h, g) = (gru.shape, gru.shape.hidden, 3 * gru.shape.hidden);
         let u = gru.part(shape.u());
         let wide = HISTORY * g;
+        let width = shape.features.step();
         self.x.clear();
         self.x.extend_from_slice(&request.histories);
-        self.x.chunks_exact_mut(STEP_FEATURES).for_each(|row| self.model.history.apply(row));
+        self.x.chunks_exact_mut(width).for_each(|row| self.model.history.apply(row));
         self.gates.clear();
         (0..tracks * HISTORY).for_each(|_| self.gates.extend_from_slice(gru.part(shape.b())));
-        let (x, w) = (View::rows(&self.x, STEP_FEATURES), View::rows(gru.part(shape.w_history()), g));
-        gemm((tracks * HISTORY, STEP_FEATURES, g), x, w, 1.0, &mut self.gates, g);
+        let (x, w) = (View::rows(&self.x, width), View::rows(gru.part(shape.w_history()), g));
+        gemm((tracks * HISTORY, width, g), x, w, 1.0, &mut self.gates, g);
         self.state.clear();
         self.state.resize(tracks * h, 0.0);
         self.reset.resize(tracks * h, 0.0);

@@ -7,12 +7,12 @@
 
 use std::collections::BTreeMap;
 
-use super::dataset::{LabelledSequence, Owner};
+use super::dataset::{LabelledFrame, LabelledSequence, Owner};
 use super::examples::Examples;
 use crate::track::{
-    Decision, FilterConfig, FrameInput, GateConfig, LinkRequest, Match, Tracker, TrackerConfig,
+    Decision, Features, FilterConfig, FrameInput, GateConfig, LinkRequest, Match, Tracker, TrackerConfig,
 };
-use crate::types::TrackId;
+use crate::types::{Embedding, TrackId};
 
 /// How pairs are made and chosen.
 #[derive(Clone, Debug, PartialEq)]
@@ -37,6 +37,10 @@ pub struct Teacher {
     pub or_distance: f64,
     /// Whether false alarms make tracks too: pairs of those with people are negatives.
     pub false_tracks: bool,
+    /// What the network reads.
+    pub features: Features,
+    /// Share of embeddings that it is not shown, so that it learns to do without.
+    pub forget: f64,
     /// The filter that predicts: the one that the network will be used with.
     pub filter: FilterConfig,
 }
@@ -54,6 +58,8 @@ impl Default for Teacher {
             or_iou: 0.1,
             or_distance: 0.5,
             false_tracks: false,
+            features: Features::default(),
+            forget: 0.1,
             filter: FilterConfig::default(),
         }
     }
@@ -68,6 +74,7 @@ impl Teacher {
             burst_chance: 0.0,
             keep_easy: 1.0,
             keep_far: 1.0,
+            forget: 0.0,
             min_score: 0.55,
             mahalanobis: gate.mahalanobis,
             or_iou: f64::INFINITY,
@@ -76,7 +83,7 @@ impl Teacher {
         }
     }
 
-    /// Adds the pairs of `sequence` to `examples`.
+    /// Adds the pairs of `sequence` to `examples`, which are of the teacher's features.
     pub fn collect(&self, sequence: &LabelledSequence, rng: &mut fastrand::Rng, examples: &mut Examples) {
         let config = self.tracker_config();
         let inner_gate = GateConfig::default().mahalanobis;
@@ -94,9 +101,15 @@ impl Teacher {
                 .collect();
             let detections: Vec<_> = usable.iter().map(|i| frame.detections[*i]).collect();
             let owners: Vec<Owner> = usable.iter().map(|i| frame.owners[*i]).collect();
+            let embeddings = self.embeddings(frame, &usable, rng);
             let (width, height) = (sequence.width, sequence.height);
-            let input =
-                FrameInput { time: frame.time, width, height, detections: &detections, embeddings: &[] };
+            let input = FrameInput {
+                time: frame.time,
+                width,
+                height,
+                detections: &detections,
+                embeddings: &embeddings,
+            };
             tracker.predict(input, &mut request);
 
             examples.push(&request, |index| {
@@ -141,11 +154,25 @@ impl Teacher {
         }
     }
 
+    /// What the tracker is shown of the looks of the `usable` detections.
+    fn embeddings(
+        &self,
+        frame: &LabelledFrame,
+        usable: &[usize],
+        rng: &mut fastrand::Rng,
+    ) -> Vec<Option<Embedding>> {
+        if !self.features.see_appearance() || frame.embeddings.is_empty() {
+            return vec![];
+        }
+        usable.iter().map(|i| frame.embeddings[*i].clone().filter(|_| rng.f64() >= self.forget)).collect()
+    }
+
     fn tracker_config(&self) -> TrackerConfig {
         let mut config = TrackerConfig { filter: self.filter, ..TrackerConfig::default() };
         config.gate.mahalanobis = self.mahalanobis;
         config.gate.or_iou = Some(self.or_iou);
         config.gate.or_distance = Some(self.or_distance);
+        config.association.features = self.features;
         config.association.high_score = self.min_score;
         config.association.low_score = self.min_score;
         // Tracks that lose their detections on purpose must outlive it.

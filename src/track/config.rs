@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use super::association::Association;
 use super::existence::ExistenceHead;
+use super::features::Features;
 use super::tracklet::Tracklet;
 
 /// All settings of a [`super::Tracker`].
@@ -171,6 +172,8 @@ impl Default for PairScore {
 pub struct AssociationConfig {
     /// How a pair is judged.
     pub method: Association,
+    /// What the link scorer is shown: what its network was trained on.
+    pub features: Features,
     /// What is maximised, for [`Association::Implicit`].
     pub score: PairScore,
     /// Detections below this score do not take part in the first stages.
@@ -198,6 +201,7 @@ impl Default for AssociationConfig {
     fn default() -> Self {
         Self {
             method: Association::default(),
+            features: Features::default(),
             score: PairScore::default(),
             high_score: 0.55,
             low_score: 0.1,

@@ -1,14 +1,10 @@
 //! What the core asks of a link scorer: the probability that a detection continues a track.
 
+use super::features::Features;
+
 /// Observations of a track that a scorer sees, the oldest first (paper: sequence length 7 with the
 /// candidate).
 pub const HISTORY: usize = 6;
-
-/// Features of one observation; [`super::features`] says which.
-pub const STEP_FEATURES: usize = 14;
-
-/// Features of a candidate pair: those of a step, then those that only a pair has.
-pub const CANDIDATE_FEATURES: usize = STEP_FEATURES + 6;
 
 /// One gated pair: an index into the request's histories and one into the frame's detections.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -24,12 +20,14 @@ pub struct Pair {
 /// Features are raw; the scorer normalises them. Row-major.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LinkRequest {
-    /// `[tracks, HISTORY, STEP_FEATURES]`: each track's observations packed from index 0 on, the
+    /// What the rows are.
+    pub features: Features,
+    /// `[tracks, HISTORY, features.step()]`: each track's observations packed from index 0 on, the
     /// oldest first; rows past its length are zero.
     pub histories: Vec<f32>,
     /// `[tracks]`: valid observations, `1..=HISTORY`.
     pub lengths: Vec<i32>,
-    /// `[pairs, CANDIDATE_FEATURES]`.
+    /// `[pairs, features.candidate()]`.
     pub candidates: Vec<f32>,
     /// `[pairs]`.
     pub pairs: Vec<Pair>,
@@ -41,7 +39,7 @@ impl LinkRequest {
         self.pairs.is_empty()
     }
 
-    /// Empties the request and keeps its memory.
+    /// Empties the request; what its rows are, and its memory, stay.
     pub fn clear(&mut self) {
         self.histories.clear();
         self.lengths.clear();

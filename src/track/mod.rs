@@ -23,6 +23,7 @@ pub mod kalman;
 mod link;
 pub mod motion;
 pub mod nearby;
+pub mod pair;
 pub mod shift;
 mod tracker;
 pub mod tracklet;
@@ -33,5 +34,6 @@ pub use config::{
     NoiseAdaptation, PairScore, ShiftConfig, TrackerConfig,
 };
 pub use existence::{Dense, EXISTENCE_FEATURES, ExistenceHead, HeadError};
-pub use link::{CANDIDATE_FEATURES, HISTORY, LinkRequest, Pair, STEP_FEATURES};
+pub use features::Features;
+pub use link::{HISTORY, LinkRequest, Pair};
 pub use tracker::{Decision, FrameInput, GatedPair, TrackError, Tracker, Update};

@@ -1,13 +1,13 @@
 //! The tracker of one camera: predict, then update, once a frame.
 
-use super::association::{self, Affinity, Match, PairView, match_pairs};
+use super::association::{self, Affinity, Match, match_pairs};
 use super::config::{ExistenceConfig, TrackerConfig};
 use super::existence;
-use super::features;
 use super::gate::PairGeometry;
 use super::link::{LinkRequest, Pair};
 use super::motion::Step;
 use super::nearby::Nearby;
+use super::pair::PairView;
 use super::shift::global_shift;
 use super::tracklet::Tracklet;
 use crate::types::{BBox, Detection, Embedding, MediaTime, TrackId, TrackReport};
@@ -198,7 +198,8 @@ impl Tracker {
         self.awaiting = false;
         for m in &decision.matches {
             let detection = self.detections[m.detection];
-            self.tracks[m.track].observe(&detection, m.link, self.time, &self.config.filter);
+            let embedding = self.embeddings.get(m.detection).and_then(Option::as_ref);
+            self.tracks[m.track].observe(&detection, embedding, m.link, self.time, &self.config.filter);
             self.learn_appearance(m);
         }
         for track in &mut self.tracks {
@@ -293,6 +294,8 @@ impl Tracker {
 
     fn gate_pairs(&mut self, request: &mut LinkRequest) {
         request.clear();
+        let features = self.config.association.features;
+        request.features = features;
         self.pairs.clear();
         let asks = self.config.association.method.asks_scorer();
         for (index, (track, predicted)) in self.tracks.iter().zip(&self.predicted).enumerate() {
@@ -308,15 +311,16 @@ impl Tracker {
                     if asks {
                         let pair = Pair { track: request.lengths.len() as u32, detection: d as u32 };
                         request.pairs.push(pair);
-                        request
-                            .candidates
-                            .extend(features::candidate(track, predicted, detection, &geometry));
+                        let embedding = self.embeddings.get(d).and_then(Option::as_ref);
+                        let geometry = &geometry;
+                        let view = PairView { track, predicted, detection, embedding, geometry };
+                        features.push_candidate(&view, self.size, &mut request.candidates);
                     }
                     self.pairs.push(GatedPair { track: index, detection: d, geometry });
                 }
             }
             if asks && self.pairs.len() > first {
-                let valid = features::push_history(track, &mut request.histories);
+                let valid = features.push_history(track, self.size, &mut request.histories);
                 request.lengths.push(valid as i32);
             }
         }

@@ -13,7 +13,7 @@ use crate::types::{BBox, ClassId, Detection, Embedding, MediaTime, TrackId, Trac
 const TYPICAL_INNOVATION: f64 = 0.1;
 
 /// One detection that was matched to a track.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Observation {
     /// The detected box, in the picture's coordinates of now (moved along with the camera).
     pub bbox: BBox,
@@ -23,6 +23,8 @@ pub struct Observation {
     pub score: f64,
     /// `(dx/h, dy/h, ln w/w', ln h/h')` against the box that was predicted for it.
     pub innovation: [f64; 4],
+    /// What it looked like.
+    pub embedding: Option<Embedding>,
 }
 
 /// Innovation of `seen` against `predicted`, in units of the predicted box.
@@ -80,7 +82,13 @@ impl Tracklet {
     ) -> Self {
         let bbox = detection.bbox;
         let mut history = VecDeque::with_capacity(HISTORY);
-        history.push_back(Observation { bbox, time, score: detection.score, innovation: [0.0; 4] });
+        history.push_back(Observation {
+            bbox,
+            time,
+            score: detection.score,
+            innovation: [0.0; 4],
+            embedding: embedding.cloned(),
+        });
         Self {
             id,
             class: detection.class,
@@ -119,13 +127,26 @@ impl Tracklet {
     }
 
     /// Takes a detection of `link` probability (Eq. mean_update, covariance_update with R*).
-    pub fn observe(&mut self, detection: &Detection, link: f64, time: MediaTime, config: &FilterConfig) {
+    pub fn observe(
+        &mut self,
+        detection: &Detection,
+        embedding: Option<&Embedding>,
+        link: f64,
+        time: MediaTime,
+        config: &FilterConfig,
+    ) {
         let (predicted, seen) = (self.bbox(), detection.bbox);
         let innovation = innovation(&predicted, &seen);
         if self.history.len() == HISTORY {
             self.history.pop_front();
         }
-        self.history.push_back(Observation { bbox: seen, time, score: detection.score, innovation });
+        self.history.push_back(Observation {
+            bbox: seen,
+            time,
+            score: detection.score,
+            innovation,
+            embedding: embedding.cloned(),
+        });
         self.mean_innovation += 0.2 * (innovation[0].hypot(innovation[1]) - self.mean_innovation);
         self.matched_since.get_or_insert(time);
         let r = measurement_noise(config, predicted.h, config.adaptation.measurement_factor(link));

@@ -1,5 +1,7 @@
 //! What a detector and a ReID model say about one frame.
 
+use std::sync::Arc;
+
 use super::{BBox, ClassId};
 
 /// One detected object of one frame.
@@ -20,9 +22,9 @@ impl Detection {
     }
 }
 
-/// An L2-normalised appearance vector of one detection. Its width is the ReID model's.
+/// An L2-normalised appearance vector of one detection. Its width is the ReID model's. Clones share it.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Embedding(Vec<f32>);
+pub struct Embedding(Arc<[f32]>);
 
 impl Embedding {
     /// Normalises `values` to unit length. A vector without a usable length (zero, not finite)
@@ -33,7 +35,7 @@ impl Embedding {
             return None;
         }
         values.iter_mut().for_each(|v| *v = (f64::from(*v) / norm) as f32);
-        Some(Self(values))
+        Some(Self(values.into()))
     }
 
     /// The values, unit length.
@@ -46,7 +48,7 @@ impl Embedding {
         if self.0.len() != other.0.len() {
             return 0.0;
         }
-        f64::from(self.0.iter().zip(&other.0).map(|(a, b)| a * b).sum::<f32>())
+        f64::from(self.0.iter().zip(&*other.0).map(|(a, b)| a * b).sum::<f32>())
     }
 
     /// Moves this embedding towards `other` by `weight` in `[0, 1]` and normalises it again.
@@ -55,7 +57,7 @@ impl Embedding {
             *self = other.clone();
             return;
         }
-        let mixed = self.0.iter().zip(&other.0).map(|(a, b)| a + (b - a) * weight).collect();
+        let mixed = self.0.iter().zip(&*other.0).map(|(a, b)| a + (b - a) * weight).collect();
         if let Some(mixed) = Self::normalised(mixed) {
             *self = mixed;
         }

@@ -34,7 +34,8 @@ impl CheckpointFile {
         // The number of threads does not change the result.
         let settings = Fit { threads: 1, ..fit.clone() };
         let digest: String = examples.fingerprint().iter().map(|byte| format!("{byte:02x}")).collect();
-        let fingerprint = format!("{} {settings:?} {digest}", args.association);
+        let fingerprint =
+            format!("{} {} {settings:?} {digest}", args.association, examples.training.features());
         let mut found = None;
         if args.resume && path.is_file() {
             let text =

@@ -18,7 +18,7 @@ use crate::learn::card::{Card, MOTCHALLENGE_LICENCE, Unseen};
 use crate::learn::dataset::{self, LabelledSequence};
 use crate::learn::network::Network;
 use crate::learn::{Epoch, Fit, HeadFit, Recipe, Split, Teacher, fit_head};
-use crate::track::{Association, FilterConfig, TrackerConfig};
+use crate::track::{Association, Features, FilterConfig, TrackerConfig};
 use crate::tuning::{FilterTuning, Tuning};
 use checkpoint::CheckpointFile;
 pub use report::Report;
@@ -51,6 +51,12 @@ pub struct Args {
     /// explicit features.
     #[arg(long, value_name = "NAME", default_value = "implicit", value_parser = ["implicit", "explicit"])]
     pub association: String,
+    /// What the network reads: boxes relative to the track; the same and how alike track and detection
+    /// look; or, as the paper has it, embeddings and boxes themselves (spatial: the boxes alone). Those with
+    /// appearance need det/det_features.npy in every sequence.
+    #[arg(long, value_name = "NAME", default_value = "relative",
+          value_parser = ["relative", "appearance", "literal", "spatial"])]
+    pub features: String,
     /// Tuning file of `gakp tune`: the filter that the network will be used with. With --loso a folder
     /// that has FOOTAGE.toml of each.
     #[arg(long, value_name = "FILE")]
@@ -72,9 +78,9 @@ pub struct Args {
     /// Draw the losses of the epochs into this SVG.
     #[arg(long, value_name = "FILE")]
     pub plot: Option<PathBuf>,
-    /// Width of the hidden state.
-    #[arg(long, default_value_t = Fit::default().hidden as u64, value_parser = clap::value_parser!(u64).range(1..=1024))]
-    pub hidden: u64,
+    /// Width of the hidden state: 32, and 134 (the paper's) for literal and spatial features.
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1024))]
+    pub hidden: Option<u64>,
     /// Examples to make.
     #[arg(long, default_value_t = Recipe::default().examples as u64, value_parser = clap::value_parser!(u64).range(1000..=20_000_000))]
     pub examples: u64,
@@ -103,7 +109,8 @@ struct Source {
 /// # Errors
 /// Data that cannot be read or is wrong, names that match nothing, and files that cannot be written.
 pub fn run(args: Args) -> Result<()> {
-    let sources = load(&args.roots)?;
+    let mut sources = load(&args.roots)?;
+    let features = features(&args, &mut sources)?;
     let known = match &args.unseen {
         Some(path) => {
             let text = fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
@@ -122,7 +129,7 @@ pub fn run(args: Args) -> Result<()> {
         fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
         for group in groups {
             let out = args.out.join(format!("{group}.onnx"));
-            report.add(train(&args, &sources, &|s| s.group == group, &out, &[])?);
+            report.add(train(&args, features, &sources, &|s| s.group == group, &out, &[])?);
         }
     } else {
         let excluded = |s: &LabelledSequence| {
@@ -136,7 +143,7 @@ pub fn run(args: Args) -> Result<()> {
         let groups: Vec<String> =
             sources.iter().map(|s| &s.labelled).filter(|s| excluded(s)).map(|s| s.group.clone()).collect();
         let out = args.out.clone();
-        report.add(train(&args, &sources, &|s| groups.contains(&s.group), &out, &known)?);
+        report.add(train(&args, features, &sources, &|s| groups.contains(&s.group), &out, &known)?);
     }
     if let Some(path) = &args.plot {
         write(path, curves(&report.epochs)?.as_bytes())?;
@@ -163,10 +170,56 @@ fn load(roots: &[PathBuf]) -> Result<Vec<Source>> {
     Ok(sources)
 }
 
+/// What `--features` names; where appearance is part of that, the sequences get theirs.
+fn features(args: &Args, sources: &mut [Source]) -> Result<Features> {
+    let literal = ["literal", "spatial"].contains(&args.features.as_str());
+    ensure!(
+        args.association != "explicit" || !literal,
+        "--association explicit weighs what relative boxes give: --features relative or appearance, not {}",
+        args.features
+    );
+    match args.features.as_str() {
+        "spatial" => Ok(Features::Literal { embedding: 0 }),
+        "literal" => Ok(Features::Literal { embedding: load_embeddings(args, sources)? }),
+        "appearance" => load_embeddings(args, sources).map(|_| Features::Appearance),
+        _ => Ok(Features::Relative),
+    }
+}
+
+/// Gives every sequence its embeddings; how wide they are.
+fn load_embeddings(args: &Args, sources: &mut [Source]) -> Result<usize> {
+    let mut width = None;
+    for Source { folder, labelled } in sources {
+        dataset::load_embeddings(folder, labelled).with_context(|| {
+            format!("--features {} needs the appearance of every sequence", args.features)
+        })?;
+        for found in labelled.frames.iter().flat_map(|f| f.embeddings.iter().flatten()) {
+            let found = found.as_slice().len();
+            let width = *width.get_or_insert(found);
+            ensure!(
+                found == width,
+                "{}: embeddings of {found} numbers, those before it have {width}",
+                folder.display()
+            );
+        }
+    }
+    width.context("no sequence has a usable embedding")
+}
+
+/// Width of the hidden state where none is given.
+fn hidden(features: Features) -> usize {
+    match features {
+        // The paper's: a step of 128 + 6 values.
+        Features::Literal { .. } => 134,
+        _ => Fit::default().hidden,
+    }
+}
+
 /// Trains one network without the sequences that `held_out` names, writes it and its card, and scores
 /// it on them.
 fn train(
     args: &Args,
+    features: Features,
     sources: &[Source],
     held_out: &dyn Fn(&LabelledSequence) -> bool,
     out: &Path,
@@ -177,7 +230,7 @@ fn train(
     let name = out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     let (filter, filter_of) = filter(args, out)?;
     let tracker = TrackerConfig { filter, ..TrackerConfig::default() };
-    let teacher = Teacher { filter: tracker.filter, ..Teacher::default() };
+    let teacher = Teacher { filter: tracker.filter, features, ..Teacher::default() };
     let recipe = Recipe { teacher, examples: args.examples as usize, seed: args.seed, ..Recipe::default() };
     let examples = collect(&recipe, &seen, &name);
     ensure!(
@@ -185,7 +238,7 @@ fn train(
         "no pair in the training sequences: are there detections that overlap truth?"
     );
     let settings = Fit {
-        hidden: args.hidden as usize,
+        hidden: args.hidden.map_or(hidden(features), |hidden| hidden as usize),
         epochs: args.epochs as usize,
         seed: args.seed,
         patience: args.patience as usize,
@@ -221,6 +274,7 @@ fn train(
         file: name,
         bytes: 0,
         licence: args.licence.clone(),
+        features,
         explicit: model.association() == Association::Explicit,
         hidden: settings.hidden,
         parameters: model.parameters(),

@@ -44,6 +44,7 @@ pub fn boxes(
     let mut scorer = Scorer::new(model.clone());
     let mut config = tracker.clone();
     config.association.method = model.association();
+    config.association.features = model.features();
     let mut boxes = Boxes::default();
     for source in seen {
         let (_, sequence, truth) = counted(source, second_half)?;
@@ -68,8 +69,8 @@ pub fn score(
 ) -> Result<Unseen> {
     let (half, counted, truth) = counted(source, second_half)?;
     let length = counted.frames.len() as u32;
-    let mut pairs = Examples::default();
-    let teacher = Teacher { filter: tracker.filter, ..Teacher::natural() };
+    let mut pairs = Examples::of(model.features());
+    let teacher = Teacher { filter: tracker.filter, features: model.features(), ..Teacher::natural() };
     teacher.collect(&counted, &mut fastrand::Rng::with_seed(0), &mut pairs);
     let link = metrics::scores(&model.logits(&pairs), pairs.labels(), pairs.weights());
 
@@ -91,8 +92,10 @@ pub fn score(
     };
     let mut config = tracker.clone();
     config.association.method = model.association();
+    config.association.features = model.features();
     config.existence.head = Some(head.clone());
-    let rows = replay(&sequence, &config, |_| vec![], links)?;
+    let embeddings = |frame: usize| counted.frames[frame].embeddings.clone();
+    let rows = replay(&sequence, &config, embeddings, links)?;
     let tracks = evaluate(&truth, &rows, length, Benchmark::of(&counted.name, &truth))
         .with_context(|| counted.name.clone())?;
     Ok(Unseen {

@@ -4,7 +4,7 @@ use super::super::descent::{Trainee, descend};
 use super::super::examples::{Examples, Split};
 use super::super::fit::{Checkpoint, Epoch, Fit, Progress};
 use super::super::gru::cross_entropy;
-use super::{ExplicitModel, ExplicitShape, Run, backward, encode, logit, sigmoid};
+use super::{ExplicitModel, Run, backward, encode, logit, sigmoid};
 use crate::track::association::explicit::COSTS;
 
 /// An example as the network takes it.
@@ -66,8 +66,7 @@ pub fn fit_explicit(
 ) -> (ExplicitModel, Vec<Epoch>) {
     settings.check(examples);
     let mut rng = fastrand::Rng::with_seed(settings.seed);
-    let shape = ExplicitShape { hidden: settings.hidden };
-    let mut model = ExplicitModel::random(shape, &examples.training, &mut rng);
+    let mut model = ExplicitModel::random(settings.hidden, &examples.training, &mut rng);
     let epochs = descend(&mut model, examples, settings, rng, from, tell);
     (model, epochs)
 }

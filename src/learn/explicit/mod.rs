@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! h      = GRU over the track's history                      (Eq. GRU)
-//! lambda = softplus(h V + v)                                 four positive weights
+//! lambda = softplus(h V + v)                                 positive weights
 //! P      = sigmoid(b - sum_k lambda_k s_k f_k)               f: squared features, s: fixed scales
 //! ```
 //!
@@ -21,15 +21,18 @@ use std::ops::Range;
 
 use super::examples::Examples;
 use super::model::Normaliser;
-use crate::track::STEP_FEATURES;
-use crate::track::association::explicit::{COSTS, costs};
+use crate::track::Features;
+use crate::track::association::explicit::{BOX_COSTS, COSTS, costs};
 
 /// Sizes of the network and where its parts lie in the parameter vector.
 ///
-/// The parts, in order, row-major: `W [STEP_FEATURES, 3 H]`, `U [H, 3 H]`, `b [3 H]`, `V [H, COSTS]`,
-/// `v [COSTS]`, the bias of the logit `[1]`; the columns of a gate block are `r`, `z`, `c`.
+/// The parts, in order, row-major, for observations of `S` values and `K` costs: `W [S, 3 H]`,
+/// `U [H, 3 H]`, `b [3 H]`, `V [H, K]`, `v [K]`, the bias of the logit `[1]`; the columns of a gate block
+/// are `r`, `z`, `c`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ExplicitShape {
+    /// What it reads; not [`Features::Literal`], whose rows lack what the costs are made of.
+    pub features: Features,
     /// Width of the hidden state.
     pub hidden: usize,
 }
@@ -39,9 +42,14 @@ impl ExplicitShape {
         3 * self.hidden
     }
 
+    /// Number of costs that are weighed: without `df` where appearance is not seen.
+    pub fn costs(self) -> usize {
+        if self.features.see_appearance() { COSTS } else { BOX_COSTS }
+    }
+
     /// `W`.
     pub fn w(self) -> Range<usize> {
-        0..STEP_FEATURES * self.gates()
+        0..self.features.step() * self.gates()
     }
 
     /// `U`.
@@ -59,13 +67,13 @@ impl ExplicitShape {
     /// `V`.
     pub fn v(self) -> Range<usize> {
         let start = self.b().end;
-        start..start + self.hidden * COSTS
+        start..start + self.hidden * self.costs()
     }
 
     /// `v`.
     pub fn v0(self) -> Range<usize> {
         let start = self.v().end;
-        start..start + COSTS
+        start..start + self.costs()
     }
 
     /// Index of the logit's bias.
@@ -93,14 +101,15 @@ pub struct ExplicitModel {
 }
 
 impl ExplicitModel {
-    /// A network of random parameters whose scales fit `examples`.
-    pub fn random(shape: ExplicitShape, examples: &Examples, rng: &mut fastrand::Rng) -> Self {
+    /// A network of random parameters whose scales fit `examples`; it reads what these are made of.
+    pub fn random(hidden: usize, examples: &Examples, rng: &mut fastrand::Rng) -> Self {
+        let shape = ExplicitShape { features: examples.features(), hidden };
         let mut theta = vec![0.0; shape.parameters()];
         let mut fill = |range: Range<usize>, bound: f32| {
             theta[range].iter_mut().for_each(|v| *v = (rng.f32() * 2.0 - 1.0) * bound);
         };
         let state = 1.0 / (shape.hidden as f32).sqrt();
-        fill(shape.w(), (1.0 / STEP_FEATURES as f32).sqrt());
+        fill(shape.w(), (1.0 / shape.features.step() as f32).sqrt());
         fill(shape.u(), state);
         fill(shape.v(), state);
         // Right pairs start with P = 0.5: weights of 0.5 each against a bias of 2.
@@ -115,7 +124,8 @@ impl ExplicitModel {
             }
         }
         let scale = sum.map(|sum| if sum > 1e-6 * count { (count / sum) as f32 } else { 1.0 });
-        Self { history: Normaliser::measure(STEP_FEATURES, examples.history_steps()), scale, shape, theta }
+        let history = Normaliser::measure(shape.features.step(), examples.history_steps());
+        Self { history, scale, shape, theta }
     }
 
     /// Scaled squared features of a candidate row.
@@ -124,10 +134,10 @@ impl ExplicitModel {
         std::array::from_fn(|i| f64::from(found[i]) * f64::from(self.scale[i]))
     }
 
-    /// The history as the network takes it, `[length, STEP_FEATURES]`.
+    /// The history as the network takes it.
     pub fn normalised(&self, history: &[f32]) -> Vec<f64> {
         let mut rows = history.to_vec();
-        rows.chunks_exact_mut(STEP_FEATURES).for_each(|row| self.history.apply(row));
+        rows.chunks_exact_mut(self.history.mean.len()).for_each(|row| self.history.apply(row));
         rows.into_iter().map(f64::from).collect()
     }
 
@@ -153,9 +163,9 @@ pub struct Run {
     gates: Vec<f64>,
     /// `[length + 1, H]`: states before each step, and the last.
     states: Vec<f64>,
-    /// `[COSTS]`: before softplus.
+    /// Before softplus.
     raw: [f64; COSTS],
-    /// The weights `lambda`.
+    /// The weights `lambda`; 0 for a cost that is not weighed.
     pub weights: [f64; COSTS],
 }
 
@@ -174,7 +184,7 @@ pub fn encode(shape: ExplicitShape, theta: &[f64], history: &[f64], run: &mut Ru
     run.states.clear();
     run.states.resize(h, 0.0);
     let mut reset = vec![0.0; h];
-    for x in history.chunks_exact(STEP_FEATURES) {
+    for x in history.chunks_exact(shape.features.step()) {
         let at = run.gates.len();
         run.gates.extend_from_slice(&theta[shape.b()]);
         let gates = &mut run.gates[at..];
@@ -193,9 +203,11 @@ pub fn encode(shape: ExplicitShape, theta: &[f64], history: &[f64], run: &mut Ru
             run.states.push(state + rz[h + i] * (c[i] - state));
         }
     }
-    run.raw.copy_from_slice(&theta[shape.v0()]);
-    add_product(&run.states[run.states.len() - h..], &theta[shape.v()], COSTS, &mut run.raw);
-    run.weights = run.raw.map(softplus);
+    let costs = shape.costs();
+    run.raw[..costs].copy_from_slice(&theta[shape.v0()]);
+    add_product(&run.states[run.states.len() - h..], &theta[shape.v()], costs, &mut run.raw[..costs]);
+    run.weights = [0.0; COSTS];
+    run.weights.iter_mut().zip(&run.raw[..costs]).for_each(|(weight, raw)| *weight = softplus(*raw));
 }
 
 /// Logit of a pair whose scaled features are `features`.
@@ -218,14 +230,15 @@ pub fn backward(
     gradient[shape.bias()] += d_logit;
     let d_raw: [f64; COSTS] = std::array::from_fn(|k| -d_logit * features[k] * sigmoid(run.raw[k]));
     gradient[shape.v0()].iter_mut().zip(&d_raw).for_each(|(g, d)| *g += d);
-    let steps = history.len() / STEP_FEATURES;
+    let (width, costs) = (shape.features.step(), shape.costs());
+    let steps = history.len() / width;
     let last = &run.states[steps * h..];
     let v = &theta[shape.v()];
     let mut d_state = vec![0.0; h];
     for i in 0..h {
-        for k in 0..COSTS {
-            d_state[i] += v[i * COSTS + k] * d_raw[k];
-            gradient[shape.v().start + i * COSTS + k] += last[i] * d_raw[k];
+        for k in 0..costs {
+            d_state[i] += v[i * costs + k] * d_raw[k];
+            gradient[shape.v().start + i * costs + k] += last[i] * d_raw[k];
         }
     }
     let mut d_gates = vec![0.0; g];
@@ -252,7 +265,7 @@ pub fn backward(
                 *d_u += d * before[i] * if j < 2 * h { 1.0 } else { r[i] };
             }
         }
-        let x = &history[step * STEP_FEATURES..(step + 1) * STEP_FEATURES];
+        let x = &history[step * width..(step + 1) * width];
         for (x, d_w) in x.iter().zip(gradient[shape.w()].chunks_exact_mut(g)) {
             d_w.iter_mut().zip(&d_gates).for_each(|(d_w, d)| *d_w += x * d);
         }

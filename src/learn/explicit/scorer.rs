@@ -2,7 +2,7 @@
 
 use super::{ExplicitModel, Run, encode, logit, sigmoid};
 use crate::track::association::explicit::COSTS;
-use crate::track::{CANDIDATE_FEATURES, HISTORY, LinkRequest, STEP_FEATURES};
+use crate::track::{HISTORY, LinkRequest};
 
 /// Scores link requests: the weights of each track once, then a sum of four for each pair.
 #[derive(Clone, Debug)]
@@ -18,7 +18,7 @@ impl ExplicitScorer {
         Self { theta: model.theta64(), model, run: Run::default() }
     }
 
-    /// The weights `lambda` of a track, given its raw history `[length, STEP_FEATURES]`.
+    /// The weights `lambda` of a track, given its raw history.
     pub fn weights(&mut self, history: &[f32]) -> [f64; COSTS] {
         encode(self.model.shape, &self.theta, &self.model.normalised(history), &mut self.run);
         self.run.weights
@@ -28,18 +28,24 @@ impl ExplicitScorer {
     /// first.
     ///
     /// # Panics
-    /// When the request's parts disagree in length or a pair names a track that is not there.
+    /// When the request's parts disagree in length, a pair names a track that is not there, or its features
+    /// are others than the model's.
     pub fn score(&mut self, request: &LinkRequest, probabilities: &mut Vec<f32>) {
-        assert_eq!(request.candidates.len(), request.pairs.len() * CANDIDATE_FEATURES);
+        probabilities.clear();
+        if request.is_empty() {
+            return;
+        }
+        let features = self.model.shape.features;
+        assert_eq!(request.features, features, "what the model reads");
+        let [step, candidate] = [features.step(), features.candidate()];
+        assert_eq!(request.candidates.len(), request.pairs.len() * candidate);
         let weights: Vec<_> = request
             .histories
-            .chunks_exact(HISTORY * STEP_FEATURES)
+            .chunks_exact(HISTORY * step)
             .zip(&request.lengths)
-            .map(|(rows, length)| self.weights(&rows[..*length as usize * STEP_FEATURES]))
+            .map(|(rows, length)| self.weights(&rows[..*length as usize * step]))
             .collect();
-        probabilities.clear();
-        for (pair, candidate) in request.pairs.iter().zip(request.candidates.chunks_exact(CANDIDATE_FEATURES))
-        {
+        for (pair, candidate) in request.pairs.iter().zip(request.candidates.chunks_exact(candidate)) {
             self.run.weights = weights[pair.track as usize];
             let features = self.model.features(candidate);
             let logit = logit(self.model.shape, &self.theta, &self.run, &features);

@@ -5,7 +5,7 @@ use super::proto::{
     AttributeProto, DimensionProto, GraphProto, NodeProto, TensorProto, TensorShapeProto, TensorTypeProto,
     TypeProto, ValueInfoProto, attribute_type, data_type,
 };
-use crate::track::{CANDIDATE_FEATURES, HISTORY, STEP_FEATURES};
+use crate::track::{Features, HISTORY};
 
 pub(super) const HISTORY_MEAN: &str = "history.mean";
 pub(super) const HISTORY_SCALE: &str = "history.scale";
@@ -35,18 +35,18 @@ impl Builder {
     }
 
     /// The graph with the inputs and the output that every link network has.
-    pub(super) fn finish(mut self) -> GraphProto {
+    pub(super) fn finish(mut self, features: Features) -> GraphProto {
         let (t, p) = (Dim::Named("T"), Dim::Named("P"));
         let [float, int32, int64] = [data_type::FLOAT, data_type::INT32, data_type::INT64];
         self.graph.input = vec![
             value(
                 "histories",
                 float,
-                &[t, Dim::Fixed(HISTORY), Dim::Fixed(STEP_FEATURES)],
+                &[t, Dim::Fixed(HISTORY), Dim::Fixed(features.step())],
                 "observations of each track, oldest first, packed from index 0",
             ),
             value("lengths", int32, &[Dim::Named("T")], "valid observations of each track, 1 to 6"),
-            value("candidates", float, &[p, Dim::Fixed(CANDIDATE_FEATURES)], "candidate of each pair"),
+            value("candidates", float, &[p, Dim::Fixed(features.candidate())], "candidate of each pair"),
             value("pair_track", int64, &[Dim::Named("P")], "row of histories of each pair"),
         ];
         self.graph.output =
@@ -110,14 +110,15 @@ impl Builder {
         self.node("Clip", &[&scaled, "clip.low", "clip.high"], &[output], vec![]);
     }
 
-    /// Histories to states: `state`, `[T, H]`, of a GRU with weights `w [STEP_FEATURES, 3 H]`, `u [H, 3 H]`
+    /// Histories to states: `state`, `[T, H]`, of a GRU with weights `w [S, 3 H]`, `u [H, 3 H]`
     /// and biases `bias [3 H]`, gates r, z, c. Leaves `axis.0` for other squeezes.
     pub(super) fn encode_histories(&mut self, normaliser: &Normaliser, w: &[f32], u: &[f32], bias: &[f32]) {
         let g = bias.len();
         let h = g / 3;
+        let width = w.len() / g;
         self.normalise("histories", "histories.z", [HISTORY_MEAN, HISTORY_SCALE], normaliser);
         self.node("Transpose", &["histories.z"], &["steps"], vec![ints("perm", &[1, 0, 2])]);
-        self.floats(GRU_W, &[1, g, STEP_FEATURES], &to_gru_op(w, STEP_FEATURES, h));
+        self.floats(GRU_W, &[1, g, width], &to_gru_op(w, width, h));
         self.floats("gru.R", &[1, g, h], &to_gru_op(u, h, h));
         let mut biases = to_gru_op(bias, 1, h);
         biases.resize(2 * g, 0.0);
@@ -214,7 +215,7 @@ pub(super) fn build(model: &LinkModel) -> GraphProto {
 
     // Candidates to gates, [P, 3 H].
     b.normalise("candidates", "candidates.z", [CANDIDATE_MEAN, CANDIDATE_SCALE], &model.candidate);
-    b.floats(W_CANDIDATE, &[CANDIDATE_FEATURES, g], gru.part(shape.w_candidate()));
+    b.floats(W_CANDIDATE, &[shape.features.candidate(), g], gru.part(shape.w_candidate()));
     b.floats(B_CANDIDATE, &[g], gru.part(shape.b()));
     b.node("Gemm", &["candidates.z", W_CANDIDATE, B_CANDIDATE], &["candidate.gates"], vec![]);
     b.integers("split.rz_c", &[2 * h as i64, h as i64]);
@@ -246,5 +247,5 @@ pub(super) fn build(model: &LinkModel) -> GraphProto {
     b.node("Squeeze", &["logit.1", "axis.1"], &["logit"], vec![]);
     b.node("Sigmoid", &["logit"], &["probability"], vec![]);
 
-    b.finish()
+    b.finish(shape.features)
 }

@@ -4,7 +4,8 @@
 //! `s = sum w_k s_k / sum w_k` over overlap with the predicted box, motion `1 - D / gate` and appearance
 //! ([`PairView::likeness`]). Where a side has no embedding, the other two remain.
 
-use super::{Affinity, PairView};
+use super::Affinity;
+use crate::track::pair::PairView;
 
 /// Weight of the overlap.
 const OVERLAP: f64 = 0.35;

@@ -5,7 +5,8 @@
 //! (colour histograms there, embeddings here; 1 where a side has none). The position is taken from the
 //! prediction, and differences are in heights, so that one width serves near and far people.
 
-use super::{Affinity, PairView};
+use super::Affinity;
+use crate::track::pair::PairView;
 use crate::track::tracklet::innovation;
 
 /// Width of `A_pos`, h.

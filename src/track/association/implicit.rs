@@ -1,7 +1,8 @@
 //! Implicit features: the GRU's link probability (Eq. GRU), the default.
 
+use super::Affinity;
 use super::iou_motion::overlap;
-use super::{Affinity, PairView};
+use crate::track::pair::PairView;
 use crate::track::{PairScore, TrackerConfig};
 
 /// The link probability as [`PairScore`] says, if it is not below the track's bound.
@@ -22,11 +23,12 @@ pub(super) fn affinity(config: &TrackerConfig, pair: &PairView<'_>, probability:
 }
 
 /// The scorer's probability (one that is not finite counts as 0), moved by appearance where both sides
-/// have one: `logit P' = logit P + weight (cosine - pivot)`.
+/// have one and the scorer has not seen it: `logit P' = logit P + weight (cosine - pivot)`.
 pub(super) fn with_appearance(config: &TrackerConfig, pair: &PairView<'_>, probability: f32) -> f64 {
     let p = if probability.is_finite() { f64::from(probability).clamp(0.0, 1.0) } else { 0.0 };
+    let seen = config.association.method.asks_scorer() && config.association.features.see_appearance();
     let config = &config.appearance;
-    if config.weight == 0.0 {
+    if seen || config.weight == 0.0 {
         return p;
     }
     let Some(cosine) = pair.cosine() else { return p };

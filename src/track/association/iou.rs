@@ -3,8 +3,9 @@
 //! Bochinski, Eiselein, Sikora, "High-Speed Tracking-by-Detection Without Using Image Information",
 //! AVSS 2017. The paper matches greedily; here the assignment is the same as everywhere else.
 
-use super::{Affinity, PairView};
+use super::Affinity;
 use crate::track::gate::PairGeometry;
+use crate::track::pair::PairView;
 use crate::track::tracklet::Tracklet;
 use crate::types::BBox;
 

@@ -3,8 +3,9 @@
 //! Also the row "IoU cost" of the ablation: the default tracker with the GRU taken out of
 //! [`super::super::PairScore::Blend`].
 
-use super::{Affinity, PairView};
+use super::Affinity;
 use crate::track::AssociationConfig;
+use crate::track::pair::PairView;
 
 /// Overlap with the predicted box, a doubtful detection counting less, beyond the least score of the
 /// track's stage of life.

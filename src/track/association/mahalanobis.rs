@@ -1,6 +1,7 @@
 //! The squared Mahalanobis distance as the cost (Eq. Mahalanobis), for comparison: it is a gate.
 
-use super::{Affinity, PairView};
+use super::Affinity;
+use crate::track::pair::PairView;
 
 /// Worth `1 - D / gate`; `C = exp(-D / 2)`, the likelihood over its peak.
 pub(super) fn affinity(gate: f64, pair: &PairView<'_>) -> Option<Affinity> {

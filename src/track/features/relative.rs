@@ -1,9 +1,9 @@
-//! What the link scorer sees of a pair.
+//! Features relative to the track.
 //!
 //! Everything is relative to the track's last box `L` (units of its height, logarithms of size
 //! ratios, seconds), so that the network is invariant to position, resolution and frame rate.
 //!
-//! A step (an observation, or the candidate), [`STEP_FEATURES`] values:
+//! A step (an observation, or the candidate), [`STEP`] values:
 //!
 //! | index | value |
 //! | --- | --- |
@@ -20,19 +20,22 @@
 //! of the prediction, 17 `min(hits, 20) / 20`, 18 seconds since the last observation, 19 IoU with
 //! the last box.
 
-use super::gate::PairGeometry;
-use super::link::{CANDIDATE_FEATURES, HISTORY, STEP_FEATURES};
-use super::tracklet::{Observation, Tracklet, innovation};
-use crate::types::{BBox, Detection, MediaTime};
+use crate::track::pair::PairView;
+use crate::track::tracklet::{Observation, Tracklet, innovation};
+use crate::types::{BBox, MediaTime};
 
+/// Values of a step.
+pub const STEP: usize = 14;
+/// Values of a candidate: those of a step, then those that only a pair has.
+pub const CANDIDATE: usize = STEP + 6;
 /// Index of the seconds since the observation before.
 pub const DT: usize = 6;
 /// Index of the first of four innovations.
 pub const INNOVATION: usize = 8;
 /// Index of a candidate's IoU with the predicted box.
-pub const IOU: usize = STEP_FEATURES;
+pub const IOU: usize = STEP;
 /// Index of a candidate's Mahalanobis distance.
-pub const MAHALANOBIS: usize = STEP_FEATURES + 1;
+pub const MAHALANOBIS: usize = STEP + 1;
 /// What the Mahalanobis distance is given in units of.
 pub const MAHALANOBIS_UNIT: f64 = 5.0;
 
@@ -47,7 +50,7 @@ struct Step<'a> {
     candidate: bool,
 }
 
-fn step(step: &Step<'_>, previous: Option<&Observation>, last: &Observation) -> [f32; STEP_FEATURES] {
+fn step(step: &Step<'_>, previous: Option<&Observation>, last: &Observation) -> [f32; STEP] {
     let (reference, h) = (&last.bbox, last.bbox.h.max(1.0));
     let (mut vx, mut vy, mut dt) = (0.0, 0.0, 0.0);
     if let Some(previous) = previous {
@@ -77,29 +80,21 @@ fn step(step: &Step<'_>, previous: Option<&Observation>, last: &Observation) -> 
     .map(|v| v as f32)
 }
 
-/// Appends a track's history, `[HISTORY, STEP_FEATURES]` padded with zeros, to `out`; returns how
-/// many observations are valid.
-pub fn push_history(track: &Tracklet, out: &mut Vec<f32>) -> usize {
+/// Appends a track's observations to `out`.
+pub(super) fn push_history(track: &Tracklet, out: &mut Vec<f32>) {
     let last = track.last();
     let mut previous = None;
     for seen in &track.history {
-        let Observation { bbox, time, score, innovation } = seen;
+        let Observation { bbox, time, score, innovation, .. } = seen;
         let this = Step { bbox, time: *time, score: *score, innovation: *innovation, candidate: false };
         out.extend(step(&this, previous, last));
         previous = Some(seen);
     }
-    let valid = track.history.len();
-    out.resize(out.len() + (HISTORY - valid) * STEP_FEATURES, 0.0);
-    valid
 }
 
-/// The features of a gated pair. `predicted` is the track's box at the detection's time.
-pub fn candidate(
-    track: &Tracklet,
-    predicted: &BBox,
-    detection: &Detection,
-    geometry: &PairGeometry,
-) -> [f32; CANDIDATE_FEATURES] {
+/// The features of a gated pair.
+pub fn candidate(pair: &PairView<'_>) -> [f32; CANDIDATE] {
+    let PairView { track, predicted, detection, geometry, .. } = *pair;
     let last = track.last();
     let this = Step {
         bbox: &detection.bbox,
@@ -108,10 +103,10 @@ pub fn candidate(
         innovation: innovation(predicted, &detection.bbox),
         candidate: true,
     };
-    let mut features = [0.0; CANDIDATE_FEATURES];
-    features[..STEP_FEATURES].copy_from_slice(&step(&this, Some(last), last));
+    let mut features = [0.0; CANDIDATE];
+    features[..STEP].copy_from_slice(&step(&this, Some(last), last));
     let std_x = track.filter.variances()[0].sqrt();
-    features[STEP_FEATURES..].copy_from_slice(
+    features[STEP..].copy_from_slice(
         &[
             geometry.iou,
             geometry.mahalanobis2.sqrt() / MAHALANOBIS_UNIT,
