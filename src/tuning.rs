@@ -86,12 +86,12 @@ pub struct Origin {
 #[derive(Debug, thiserror::Error)]
 pub enum TuningError {
     /// It cannot be read.
-    #[error("cannot read the tuning file {}: {source}", path.display())]
+    #[error("cannot read the tuning file {}: {reason}", path.display())]
     Read {
         /// Which.
         path: PathBuf,
         /// Why.
-        source: std::io::Error,
+        reason: std::io::Error,
     },
     /// It is no TOML, or has a key that does not exist.
     #[error("in the tuning file {}: {message}", path.display())]
@@ -128,7 +128,7 @@ impl Tuning {
     /// It cannot be read, has an unknown key, or a value that is wrong; the message names file and key.
     pub fn read(path: &Path) -> Result<Self, TuningError> {
         let text =
-            fs::read_to_string(path).map_err(|source| TuningError::Read { path: path.to_owned(), source })?;
+            fs::read_to_string(path).map_err(|reason| TuningError::Read { path: path.to_owned(), reason })?;
         let tuning: Self = toml::from_str(&text)
             .map_err(|error| TuningError::Parse { path: path.to_owned(), message: error.to_string() })?;
         if let Some((key, value)) = tuning.filter.mistake() {

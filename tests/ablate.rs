@@ -9,7 +9,7 @@ use serde_json::Value;
 
 mod infer_support;
 
-const ROWS: [&str; 11] = [
+const ROWS: [&str; 15] = [
     "IOU",
     "IOU + motion (IoU cost)",
     "IOU + motion + deep",
@@ -18,6 +18,10 @@ const ROWS: [&str; 11] = [
     "Huang",
     "explicit + deep",
     "implicit + deep",
+    "explicit, looks learned",
+    "implicit, looks learned",
+    "implicit, literal, boxes alone",
+    "implicit, literal",
     "explicit, fixed weights",
     "implicit, -ln P",
     "Mahalanobis cost",
@@ -232,8 +236,12 @@ fn networks_are_those_of_the_footage() {
     assert_eq!(implicit("A")["missing"], "no network for this footage in 1 of 2 sequences");
     assert_eq!(row(&report, "B", "implicit + deep")["figures"]["IDs"], 0);
     put("MOT17-91", "explicit");
+    // The first network of a folder says what all of them are.
     let message = refused(&run());
-    assert!(message.contains("no network of the association \"implicit\""), "{message}");
+    assert!(message.contains("MOT17-92.onnx is of another kind (Implicit)"), "{message}");
+    std::fs::remove_dir_all(&links).expect("removed");
+    std::fs::create_dir_all(&links).expect("created");
+    assert!(refused(&run()).contains("no network in"));
 }
 
 #[test]

@@ -8,6 +8,8 @@ use std::path::{Path, PathBuf};
 use clap::Parser;
 use gakp::cli::train;
 use gakp::learn::onnx;
+use gakp::mot::{Matrix, write_npy};
+use gakp::track::Features;
 
 #[derive(Parser)]
 struct Command {
@@ -41,6 +43,20 @@ fn write_sequence(root: &Path, name: &str, pace: f64) {
     }
     let ini = format!("[Sequence]\nname={name}\nframeRate=25\nseqLength=60\nimWidth=640\nimHeight=480\n");
     fs::write(folder.join("seqinfo.ini"), ini).expect("written");
+}
+
+/// Gives a sequence of [`write_sequence`] embeddings, each person one of its own.
+fn write_features(folder: &Path, width: usize) {
+    let text = fs::read_to_string(folder.join("det/det.txt")).expect("detections");
+    let mut values = vec![];
+    for line in text.lines() {
+        // Whom a row is of stands in its height on the picture.
+        let y: f64 = line.split(',').nth(3).and_then(|y| y.parse().ok()).expect("a number");
+        let person = ((y - 100.0) / 12.0).round() as usize;
+        values.extend((0..width).map(|i| if i == person { 1.0 } else { 0.2 + 0.01 * (y - 100.0) }));
+    }
+    let matrix = Matrix { rows: values.len() / width, columns: width, values };
+    fs::write(folder.join("det/det_features.npy"), write_npy(&matrix)).expect("written");
 }
 
 fn world() -> tempfile::TempDir {
@@ -137,6 +153,53 @@ fn leaves_each_footage_out_once() {
         assert_eq!(onnx::read(&bytes).expect("a link model").1["sequences"], seen);
     }
     assert!(!out.join("walk.onnx").exists());
+}
+
+#[test]
+fn trains_every_kind_of_features() {
+    let root = world();
+    for name in ["MOT17-01-A", "MOT17-02-A"] {
+        write_features(&root.path().join(name), 8);
+    }
+    let at = |name: &str| root.path().join(name).display().to_string();
+    let [first, second] = ["MOT17-01-A", "MOT17-02-A"].map(at);
+    let run =
+        |text: &str| train::run(args(&format!("{text} --out {} --examples 2000 --epochs 1", at("x.onnx"))));
+    let trained = |text: &str| {
+        run(text).expect("trained");
+        onnx::read(&fs::read(at("x.onnx")).expect("a file")).expect("a link model")
+    };
+    for (name, features, hidden) in [
+        ("relative", Features::Relative, 32),
+        ("appearance", Features::Appearance, 32),
+        ("literal", Features::Literal { embedding: 8 }, 134),
+        ("spatial", Features::Literal { embedding: 0 }, 134),
+    ] {
+        let (model, _) = trained(&format!("{first} {second} --exclude MOT17-02 --features {name}"));
+        assert_eq!((model.features(), model.gru.shape.hidden), (features, hidden));
+        let card = fs::read_to_string(at("x.md")).expect("a card");
+        let width = format!("`candidates` | f32 `[P, {}]`", features.candidate());
+        assert!(card.contains(&width), "{width:?} is not in\n{card}");
+    }
+    // Without looks of its own, a sequence is given simulated ones, or the run is refused.
+    let walk = at("walk");
+    let refused = |text: &str| format!("{:#}", run(text).expect_err("refused"));
+    let message = refused(&format!("{first} {walk} --features appearance"));
+    assert!(
+        message.contains("walk/det/det_features.npy") && message.contains("--simulate-looks"),
+        "{message}"
+    );
+    let (_, metadata) = trained(&format!("{first} {walk} --features appearance --simulate-looks"));
+    assert_eq!(metadata["embeddings"], "simulated for sequences that have none");
+    let message = refused(&format!("{walk} --features literal --simulate-looks"));
+    assert!(message.contains("no sequence has a usable embedding"), "{message}");
+    let message = refused(&format!("{first} --features literal --association explicit"));
+    assert!(message.contains("--features relative or appearance, not literal"), "{message}");
+    write_features(&root.path().join("MOT17-02-A"), 9);
+    let message = refused(&format!("{first} {second} --features literal"));
+    assert!(message.contains("MOT17-02-A: embeddings of 9 numbers, those before it have 8"), "{message}");
+    run(&format!("{first} {walk} --features appearance --simulate-looks --association explicit"))
+        .expect("trained");
 }
 
 #[test]

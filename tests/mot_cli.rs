@@ -1,4 +1,4 @@
-//! `gakp eval` and `gakp simulate` as a user runs them.
+//! `gakp eval`, `gakp simulate` and `gakp split` as a user runs them.
 #![cfg(feature = "cli")]
 
 use std::path::{Path, PathBuf};
@@ -166,4 +166,62 @@ fn a_simulated_world_is_written_as_sequences_and_is_the_same_again() {
     let refused = simulate(&folder.path().join("file"), &small);
     assert_eq!(refused.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&refused.stderr).contains("cannot create"));
+}
+
+fn split(args: &[&Path]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_gakp")).arg("split").args(args).output().unwrap()
+}
+
+#[test]
+fn halves_are_the_sequence() {
+    let folder = tempfile::tempdir().unwrap();
+    let (sequence, out) = (folder.path().join("MOT17-77-X"), folder.path().join("halves"));
+    for within in ["gt", "det"] {
+        std::fs::create_dir_all(sequence.join(within)).unwrap();
+    }
+    let write = |file: &str, bytes: &[u8]| std::fs::write(sequence.join(file), bytes).unwrap();
+    let ini = "[Sequence]\nname=X\nframeRate=12.5\nseqLength=7\nimWidth=64\nimHeight=48\n";
+    write("seqinfo.ini", ini.as_bytes());
+    // Frames out of order and a blank line: what follows the frame stays as it is, to the letter.
+    write(
+        "gt/gt.txt",
+        b"7,3,1,2,3,4,1,1,0.125\n\n1,3,1.50,2,3,4,1,1,1\n4,3,1,2,3,4,0,7,1\n5,3,1,2,3,4,1,1,1\n",
+    );
+    write("det/det.txt", b"1,-1,5,6,7,8,0.9\n4,-1,5,6,7,8,0.8\n5,-1,5,6,7,8,0.7\n7,-1,5,6,7,8,1e-1\n");
+    let values: Vec<u8> = [1.0f64, 4.0, 5.0, 7.0]
+        .iter()
+        .flat_map(|frame| [*frame, -1.0, 5.0, 6.0, 7.0, 8.0, 0.9, frame * 0.1, 0.5])
+        .flat_map(f64::to_le_bytes)
+        .collect();
+    let header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (4, 9), }";
+    let npy = [&b"\x93NUMPY\x01\x00"[..], &(header.len() as u16).to_le_bytes(), header, &values].concat();
+    write("det/det_features.npy", &npy);
+
+    stdout(&split(&[&sequence, Path::new("--out"), &out]));
+    let read = |half: &str, file: &str| {
+        std::fs::read_to_string(out.join(format!("MOT17-77{half}-X")).join(file)).unwrap()
+    };
+    assert_eq!(read("a", "gt/gt.txt"), "1,3,1.50,2,3,4,1,1,1\n4,3,1,2,3,4,0,7,1\n");
+    assert_eq!(read("b", "gt/gt.txt"), "3,3,1,2,3,4,1,1,0.125\n1,3,1,2,3,4,1,1,1\n");
+    assert_eq!(read("b", "det/det.txt"), "1,-1,5,6,7,8,0.7\n3,-1,5,6,7,8,1e-1\n");
+    for (half, frames) in [("a", 4), ("b", 3)] {
+        let ini = read(half, "seqinfo.ini");
+        for line in [format!("seqLength={frames}"), "frameRate=12.5".into(), format!("name=MOT17-77{half}-X")]
+        {
+            assert!(ini.lines().any(|l| l == line), "{line:?} is not in {ini:?}");
+        }
+    }
+    let features = |half: &str| {
+        let file = out.join(format!("MOT17-77{half}-X/det/det_features.npy"));
+        gakp::mot::parse_npy(&std::fs::read(file).unwrap()).unwrap()
+    };
+    assert_eq!((features("a").rows, features("b").rows), (2, 2));
+    assert_eq!(features("a").row(1), [4.0, -1.0, 5.0, 6.0, 7.0, 8.0, 0.9, 0.4, 0.5]);
+    assert_eq!(features("b").row(1)[..2], [3.0, -1.0], "the frame of the half");
+
+    write("det/det_features.npy", b"x");
+    let output = split(&[&sequence, Path::new("--out"), &out]);
+    let message = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2));
+    assert!(message.contains("MOT17-77-X: det/det_features.npy: not a NumPy array file"), "{message}");
 }

@@ -14,6 +14,7 @@ pub mod serve;
 #[cfg(any(feature = "service", feature = "testcam"))]
 mod signals;
 pub mod simulate;
+pub mod split;
 #[cfg(feature = "service")]
 pub mod track;
 #[cfg(feature = "learn")]
@@ -60,6 +61,8 @@ pub enum Command {
     Bench(bench::Args),
     /// Write a simulated world of pedestrians as MOTChallenge sequences.
     Simulate(simulate::Args),
+    /// Cut MOTChallenge sequences in halves, to train on one and test on the other.
+    Split(split::Args),
     /// Train the link scorer on MOTChallenge sequences.
     #[cfg(feature = "learn")]
     Train(train::Args),
@@ -87,6 +90,7 @@ pub fn run(cli: Cli) -> anyhow::Result<()> {
         #[cfg(feature = "service")]
         Command::Bench(args) => bench::run(args),
         Command::Simulate(args) => simulate::run(args),
+        Command::Split(args) => split::run(args),
         #[cfg(feature = "learn")]
         Command::Train(args) => train::run(args),
         #[cfg(feature = "learn")]

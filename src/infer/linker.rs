@@ -103,6 +103,14 @@ impl Linker {
         })
     }
 
+    /// What its probabilities are named after.
+    pub fn association(&self) -> Association {
+        match self.family {
+            Family::Explicit => Association::Explicit,
+            _ => Association::Implicit,
+        }
+    }
+
     /// What it reads.
     pub fn features(&self) -> Features {
         self.surroundings.features

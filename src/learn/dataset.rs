@@ -22,6 +22,9 @@ const NEAR_IOU: f64 = 0.3;
 /// identity that a tracker must keep.
 const CLASSES: [i32; 5] = [1, 2, 7, 8, 12];
 
+/// Where a sequence's folder has its appearance vectors.
+pub const EMBEDDINGS: &str = "det/det_features.npy";
+
 /// Whose a detection is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Owner {
@@ -67,36 +70,36 @@ pub struct LabelledSequence {
 #[derive(Debug, thiserror::Error)]
 pub enum DatasetError {
     /// A file or folder that cannot be read.
-    #[error("cannot read {}: {source}", path.display())]
+    #[error("cannot read {}: {reason}", path.display())]
     Read {
         /// Which.
         path: PathBuf,
         /// Why.
-        source: std::io::Error,
+        reason: std::io::Error,
     },
     /// A file with a wrong row.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {reason}", path.display())]
     Rows {
         /// Which.
         path: PathBuf,
         /// What is wrong.
-        source: RowError,
+        reason: RowError,
     },
     /// A wrong `seqinfo.ini`.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {reason}", path.display())]
     Info {
         /// Which.
         path: PathBuf,
         /// What is wrong.
-        source: SeqInfoError,
+        reason: SeqInfoError,
     },
     /// Appearance vectors that do not fit.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {reason}", path.display())]
     Features {
         /// Which.
         path: PathBuf,
         /// What is wrong.
-        source: FeatureError,
+        reason: FeatureError,
     },
     /// A folder without sequences.
     #[error(
@@ -116,7 +119,7 @@ pub fn folders(root: &Path) -> Result<Vec<PathBuf>, DatasetError> {
     if is_sequence(root) {
         return Ok(vec![root.to_path_buf()]);
     }
-    let wrong = |source| DatasetError::Read { path: root.to_path_buf(), source };
+    let wrong = |reason| DatasetError::Read { path: root.to_path_buf(), reason };
     let mut found = vec![];
     for entry in fs::read_dir(root).map_err(wrong)? {
         let path = entry.map_err(wrong)?.path();
@@ -138,26 +141,26 @@ pub fn folders(root: &Path) -> Result<Vec<PathBuf>, DatasetError> {
 pub fn load(folder: &Path) -> Result<LabelledSequence, DatasetError> {
     let read = |file: &str| {
         let path = folder.join(file);
-        fs::read_to_string(&path).map_err(|source| DatasetError::Read { path, source })
+        fs::read_to_string(&path).map_err(|reason| DatasetError::Read { path, reason })
     };
-    let rows = |file: &str, source| DatasetError::Rows { path: folder.join(file), source };
+    let rows = |file: &str, reason| DatasetError::Rows { path: folder.join(file), reason };
     let info = SequenceInfo::parse(&read("seqinfo.ini")?)
-        .map_err(|source| DatasetError::Info { path: folder.join("seqinfo.ini"), source })?;
+        .map_err(|reason| DatasetError::Info { path: folder.join("seqinfo.ini"), reason })?;
     let truth = parse_truth(&read("gt/gt.txt")?, Some(info.length)).map_err(|e| rows("gt/gt.txt", e))?;
     let sequence = Sequence::parse(info, &read("det/det.txt")?).map_err(|e| rows("det/det.txt", e))?;
     let name = folder.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     Ok(join(name, sequence, &truth))
 }
 
-/// Gives `sequence`, which [`load`] read from `folder`, its appearance vectors, det/det_features.npy.
+/// Gives `sequence`, which [`load`] read from `folder`, its appearance vectors: [`EMBEDDINGS`].
 ///
 /// # Errors
 /// A file that cannot be read or does not fit the detections.
 pub fn load_embeddings(folder: &Path, sequence: &mut LabelledSequence) -> Result<(), DatasetError> {
-    let path = folder.join("det/det_features.npy");
-    let bytes = fs::read(&path).map_err(|source| DatasetError::Read { path: path.clone(), source })?;
+    let path = folder.join(EMBEDDINGS);
+    let bytes = fs::read(&path).map_err(|reason| DatasetError::Read { path: path.clone(), reason })?;
     let det = folder.join("det/det.txt");
-    let rows = fs::read_to_string(&det).map_err(|source| DatasetError::Read { path: det, source })?;
+    let rows = fs::read_to_string(&det).map_err(|reason| DatasetError::Read { path: det, reason })?;
     let info = SequenceInfo {
         name: sequence.name.clone(),
         frame_rate: sequence.frame_rate,
@@ -166,7 +169,7 @@ pub fn load_embeddings(folder: &Path, sequence: &mut LabelledSequence) -> Result
         height: sequence.height as u32,
     };
     let found = SequenceEmbeddings::parse(&bytes, &rows, &info)
-        .map_err(|source| DatasetError::Features { path, source })?;
+        .map_err(|reason| DatasetError::Features { path, reason })?;
     for (index, frame) in sequence.frames.iter_mut().enumerate() {
         frame.embeddings = found.frame(index).to_vec();
     }

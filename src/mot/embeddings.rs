@@ -89,6 +89,11 @@ impl SequenceEmbeddings {
         self.frames.get(index).map_or(&[], Vec::as_slice)
     }
 
+    /// Numbers in an embedding; `None` where there is none.
+    pub fn width(&self) -> Option<usize> {
+        self.frames.iter().flatten().flatten().next().map(|embedding| embedding.as_slice().len())
+    }
+
     /// Those of the frames after [`first_half_length`], as [`super::Sequence::second_half`].
     pub fn second_half(mut self) -> Self {
         let skip = (first_half_length(self.frames.len() as u32) as usize).min(self.frames.len());

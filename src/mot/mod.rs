@@ -26,7 +26,7 @@ pub use clear::Clear;
 pub use embeddings::{FeatureError, SequenceEmbeddings};
 pub use hota::{ALPHAS, Hota};
 pub use identity::Identity;
-pub use npy::{Matrix, NpyError, parse_npy};
+pub use npy::{Matrix, NpyError, parse_npy, write_npy};
 pub use preprocess::{Benchmark, EvalError};
 pub use replay::{replay, report_rows, result_rows};
 pub use rows::{

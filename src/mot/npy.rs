@@ -87,6 +87,21 @@ pub fn parse_npy(bytes: &[u8]) -> Result<Matrix, NpyError> {
     Ok(Matrix { rows, columns, values })
 }
 
+/// A `.npy` file of `float64`, C order.
+pub fn write_npy(matrix: &Matrix) -> Vec<u8> {
+    let Matrix { rows, columns, values } = matrix;
+    let mut header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({rows}, {columns}), }}");
+    // The values begin at a multiple of 64 bytes; ten come before the header.
+    let padded = (header.len() + 1 + 10).next_multiple_of(64) - 10;
+    header.push_str(&" ".repeat(padded - header.len() - 1));
+    header.push('\n');
+    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+    bytes.extend((header.len() as u16).to_le_bytes());
+    bytes.extend(header.bytes());
+    bytes.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+    bytes
+}
+
 /// What follows `'key':` in the header's dictionary.
 fn value<'a>(header: &'a str, key: &str) -> Option<&'a str> {
     let (_, rest) = header.split_once(&format!("'{key}'"))?;
@@ -111,6 +126,7 @@ mod tests {
         let narrow: Vec<u8> = [1.5f32, -2.0].iter().flat_map(|v| v.to_le_bytes()).collect();
         let header = "{'shape': (1, 2), 'fortran_order': False, 'descr': '<f4'}";
         assert_eq!(parse_npy(&file(header, &narrow)).unwrap().values, [1.5, -2.0]);
+        assert_eq!(parse_npy(&write_npy(&found)), Ok(found));
         let empty = "{'descr': '<f4', 'fortran_order': False, 'shape': (0, 128), }";
         assert_eq!(parse_npy(&file(empty, &[])).unwrap().rows, 0);
     }

@@ -28,14 +28,14 @@ pub struct Remembered {
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// Reading or writing failed.
-    #[error("cannot {verb} {path}: {source}; give another folder with --state-dir", path = path.display())]
+    #[error("cannot {verb} {path}: {reason}; give another folder with --state-dir", path = path.display())]
     Io {
         /// What was tried.
         verb: &'static str,
         /// On what.
         path: PathBuf,
         /// What went wrong.
-        source: io::Error,
+        reason: io::Error,
     },
     /// The file is not what was written.
     #[error("{path} is damaged ({reason}): mend it or move it away; the cameras in it are lost otherwise", path = path.display())]
@@ -58,7 +58,7 @@ impl Store {
             Ok(text) => serde_json::from_str(&text)
                 .map_err(|reason| StoreError::Damaged { path: path.clone(), reason })?,
             Err(error) if error.kind() == io::ErrorKind::NotFound => Remembered::default(),
-            Err(source) => return Err(StoreError::Io { verb: "read", path, source }),
+            Err(reason) => return Err(StoreError::Io { verb: "read", path, reason }),
         };
         Ok((Self { path }, remembered))
     }
@@ -69,10 +69,10 @@ impl Store {
     /// [`StoreError::Io`].
     pub fn make_folder(&self) -> Result<(), StoreError> {
         let folder = self.path.parent().unwrap_or(&self.path);
-        fs::create_dir_all(folder).map_err(|source| StoreError::Io {
+        fs::create_dir_all(folder).map_err(|reason| StoreError::Io {
             verb: "make the folder",
             path: folder.to_path_buf(),
-            source,
+            reason,
         })
     }
 
@@ -94,7 +94,7 @@ impl Store {
             }
             Ok(())
         };
-        write().map_err(|source| StoreError::Io { verb: "write", path: self.path.clone(), source })
+        write().map_err(|reason| StoreError::Io { verb: "write", path: self.path.clone(), reason })
     }
 }
 

@@ -1,22 +1,21 @@
 //! `gakp ablate`: the paper's table, every association in one run.
 
+mod networks;
 mod table;
 mod variant;
 mod world;
 
-use std::collections::BTreeMap;
 use std::io::Write as _;
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::path::PathBuf;
 use std::time::Instant;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result};
 
 use super::models::ModelArgs;
 use crate::config::{Config, ModelConfig};
-use crate::infer::{Linker, ModelSettings};
 use crate::mot::{evaluate, replay};
-use crate::track::{Association, LinkRequest, TrackerConfig};
+use crate::track::{LinkRequest, TrackerConfig};
+use networks::{Kind, Networks};
 use table::{Cell, Missing};
 use variant::Variant;
 use world::World;
@@ -32,12 +31,10 @@ pub struct Args {
     /// Folder of MOTChallenge sequences, each with gt/gt.txt, det/det.txt and seqinfo.ini.
     root: PathBuf,
     /// Folder of networks that leave one footage out, DIR/FOOTAGE.onnx, as `gakp train --loso` writes
-    /// them. Without, --link names one network for everything.
+    /// them; several times, for each kind of network (--association and --features of `gakp train`).
+    /// Without, --link names one network for everything.
     #[arg(long, value_name = "DIR")]
-    links: Option<PathBuf>,
-    /// The same for explicit features, as `gakp train --association explicit --loso` writes them.
-    #[arg(long, value_name = "DIR")]
-    explicit_links: Option<PathBuf>,
+    links: Vec<PathBuf>,
     /// Only sequences whose names end in -SUFFIX; several, with commas between, in this order.
     #[arg(long, value_name = "SUFFIX", value_delimiter = ',')]
     det: Vec<String>,
@@ -63,7 +60,10 @@ pub fn run(args: Args) -> Result<()> {
     let config = args.config.as_deref().map(Config::read).transpose()?.unwrap_or_default();
     let models = ModelConfig::from(args.models.clone()).or(config.models);
     let worlds = world::load(&args.root, &args.det, &args.second_half)?;
-    let mut networks = Networks::new(&args, models)?;
+    let single = models.link.is_some();
+    let mut settings = models.settings()?;
+    settings.threads = Some(1);
+    let mut networks = Networks::new(&args.links, settings, single)?;
     let variants = variant::all(&config.tracker.apply(TrackerConfig::default())?);
     let results = worlds
         .iter()
@@ -72,8 +72,8 @@ pub fn run(args: Args) -> Result<()> {
             // The same filter and the same decision on what is output for every row, so that only the
             // association differs.
             let mut base = TrackerConfig::default();
-            for association in [Association::Implicit, Association::Explicit] {
-                if let Some(linker) = networks.get(association, &world.footage)? {
+            for kind in Kind::ALL {
+                if let Some(linker) = networks.get(kind, &world.footage)? {
                     base = linker.calibrate(base);
                     break;
                 }
@@ -96,14 +96,20 @@ fn measure(world: &World, variant: &Variant, networks: &mut Networks) -> Result<
     if variant.appearance && world.embeddings.is_none() {
         return Ok(Cell::Missing(Missing::Embeddings));
     }
-    let method = variant.config.association.method;
-    let linker = match method.asks_scorer() {
-        true => match networks.get(method, &world.footage)? {
+    let mut config = variant.config.clone();
+    let linker = match variant.network {
+        Some(kind) => match networks.get(kind, &world.footage)? {
             Some(linker) => Some(linker),
             None => return Ok(Cell::Missing(Missing::Network)),
         },
-        false => None,
+        None => None,
     };
+    if let Some(linker) = &linker {
+        config.association.features = linker.features();
+        if let Some(embeddings) = world.embeddings.as_ref().filter(|_| variant.appearance) {
+            linker.check_embeddings(embeddings.width()).with_context(|| world.name.clone())?;
+        }
+    }
     let embeddings = |frame: usize| match &world.embeddings {
         Some(embeddings) if variant.appearance => embeddings.frame(frame).to_vec(),
         _ => Vec::new(),
@@ -113,72 +119,9 @@ fn measure(world: &World, variant: &Variant, networks: &mut Networks) -> Result<
         None => Ok(Vec::new()),
     };
     let start = Instant::now();
-    let rows = replay(&world.sequence, &variant.config, embeddings, links)?;
+    let rows = replay(&world.sequence, &config, embeddings, links)?;
     let seconds = start.elapsed().as_secs_f64();
     let frames = world.sequence.info.length;
     let score = evaluate(&world.truth, &rows, frames, world.benchmark).with_context(|| world.name.clone())?;
     Ok(Cell::Scored { score: Box::new(score), seconds, frames })
-}
-
-/// Link networks by association and footage, loaded when they are first asked for.
-struct Networks {
-    settings: ModelSettings,
-    /// Folder of one association's networks; one network for all footage otherwise.
-    folders: [(Association, Option<PathBuf>); 2],
-    single: bool,
-    loaded: BTreeMap<(&'static str, String), Option<Linker>>,
-}
-
-impl Networks {
-    fn new(args: &Args, models: ModelConfig) -> Result<Self> {
-        let single = models.link.is_some();
-        for folder in [&args.links, &args.explicit_links].into_iter().flatten() {
-            ensure!(folder.is_dir(), "there is no folder {}", folder.display());
-        }
-        let mut settings = models.settings()?;
-        settings.threads = Some(1);
-        let folders = [
-            (Association::Implicit, args.links.clone()),
-            (Association::Explicit, args.explicit_links.clone()),
-        ];
-        Ok(Self { settings, folders, single, loaded: BTreeMap::new() })
-    }
-
-    /// The network for `footage`, one that has not seen it; `None` when there is none.
-    fn get(&mut self, association: Association, footage: &str) -> Result<Option<Linker>> {
-        let folder = self.folders.iter().find(|(of, _)| *of == association).and_then(|(_, f)| f.as_deref());
-        let name = match folder {
-            Some(_) => footage.to_string(),
-            None => String::new(),
-        };
-        let key = (association.as_str(), name);
-        if !self.loaded.contains_key(&key) {
-            let linker = self.load(association, folder, footage)?;
-            self.loaded.insert(key.clone(), linker);
-        }
-        Ok(self.loaded.get(&key).cloned().flatten())
-    }
-
-    fn load(&self, association: Association, folder: Option<&Path>, footage: &str) -> Result<Option<Linker>> {
-        let mut settings = self.settings.clone();
-        match folder {
-            Some(folder) => {
-                let file = folder.join(format!("{footage}.onnx"));
-                if !file.is_file() {
-                    return Ok(None);
-                }
-                settings.link = file.display().to_string();
-            }
-            // The shipped network may have been trained on this very footage.
-            None if !self.single || association != Association::Implicit => return Ok(None),
-            None => {}
-        }
-        let linker = Linker::load(&settings, Arc::new(()))?;
-        linker.check_suits(association)?;
-        Ok(Some(linker))
-    }
-
-    fn end(self) {
-        self.loaded.values().flatten().for_each(Linker::shutdown);
-    }
 }

@@ -67,6 +67,9 @@ impl Work {
     }
 
     fn track(&self, Input { sequence, embeddings }: &Input, out: &mut Output) -> Result<()> {
+        if let Some(linker) = &self.linker {
+            linker.check_embeddings(embeddings.width())?;
+        }
         let bar = progress::frames(Some(sequence.detections.len() as u64), &sequence.info.name);
         let embeddings = |frame: usize| {
             bar.set_position(frame as u64 + 1);

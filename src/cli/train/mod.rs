@@ -17,7 +17,7 @@ use sha2::{Digest, Sha256};
 use crate::learn::card::{Card, MOTCHALLENGE_LICENCE, Unseen};
 use crate::learn::dataset::{self, LabelledSequence};
 use crate::learn::network::Network;
-use crate::learn::{Epoch, Fit, HeadFit, Recipe, Split, Teacher, fit_head};
+use crate::learn::{Epoch, Fit, HeadFit, Looks, Recipe, Split, Teacher, fit_head};
 use crate::track::{Association, Features, FilterConfig, TrackerConfig};
 use crate::tuning::{FilterTuning, Tuning};
 use checkpoint::CheckpointFile;
@@ -57,6 +57,10 @@ pub struct Args {
     #[arg(long, value_name = "NAME", default_value = "relative",
           value_parser = ["relative", "appearance", "literal", "spatial"])]
     pub features: String,
+    /// Simulate the embeddings of sequences that have none, from the statistics of those that have some among
+    /// the sequences that the network is trained on.
+    #[arg(long)]
+    pub simulate_looks: bool,
     /// Tuning file of `gakp tune`: the filter that the network will be used with. With --loso a folder
     /// that has FOOTAGE.toml of each.
     #[arg(long, value_name = "FILE")]
@@ -99,6 +103,7 @@ pub struct Args {
 }
 
 /// A sequence and where its files are.
+#[derive(Clone)]
 struct Source {
     folder: PathBuf,
     labelled: LabelledSequence,
@@ -190,8 +195,12 @@ fn features(args: &Args, sources: &mut [Source]) -> Result<Features> {
 fn load_embeddings(args: &Args, sources: &mut [Source]) -> Result<usize> {
     let mut width = None;
     for Source { folder, labelled } in sources {
+        if args.simulate_looks && !folder.join(dataset::EMBEDDINGS).is_file() {
+            continue;
+        }
         dataset::load_embeddings(folder, labelled).with_context(|| {
-            format!("--features {} needs the appearance of every sequence", args.features)
+            let features = &args.features;
+            format!("--features {features} needs the appearance of every sequence, or --simulate-looks")
         })?;
         for found in labelled.frames.iter().flat_map(|f| f.embeddings.iter().flatten()) {
             let found = found.as_slice().len();
@@ -204,6 +213,20 @@ fn load_embeddings(args: &Args, sources: &mut [Source]) -> Result<usize> {
         }
     }
     width.context("no sequence has a usable embedding")
+}
+
+/// The sequences, those without embeddings with simulated ones.
+fn dress(seen: &[&Source], seed: u64) -> Result<Vec<Source>> {
+    let bare = |sequence: &LabelledSequence| sequence.frames.iter().all(|frame| frame.embeddings.is_empty());
+    let known: Vec<&LabelledSequence> = seen.iter().map(|s| &s.labelled).filter(|s| !bare(s)).collect();
+    let looks = Looks::of(&known)
+        .context("--simulate-looks: none of the training sequences has embeddings of two people or more")?;
+    let mut rng = fastrand::Rng::with_seed(seed);
+    let mut dressed: Vec<Source> = seen.iter().copied().cloned().collect();
+    for Source { labelled, .. } in dressed.iter_mut().filter(|s| bare(&s.labelled)) {
+        looks.dress(labelled, &mut rng);
+    }
+    Ok(dressed)
 }
 
 /// Width of the hidden state where none is given.
@@ -227,6 +250,11 @@ fn train(
 ) -> Result<Trained> {
     let (held, seen): (Vec<&Source>, Vec<&Source>) = sources.iter().partition(|s| held_out(&s.labelled));
     ensure!(!seen.is_empty(), "nothing to train on: every sequence is held out");
+    let dressed = match features.see_appearance() && args.simulate_looks {
+        true => dress(&seen, args.seed)?,
+        false => vec![],
+    };
+    let seen = if dressed.is_empty() { seen } else { dressed.iter().collect() };
     let name = out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     let (filter, filter_of) = filter(args, out)?;
     let tracker = TrackerConfig { filter, ..TrackerConfig::default() };
@@ -285,6 +313,9 @@ fn train(
         settings: describe(&settings, &recipe, (&tracker.filter, filter_of)),
         unseen: known.iter().chain(&scores).cloned().collect(),
     };
+    if !dressed.is_empty() {
+        card.settings.push(("embeddings".into(), "simulated for sequences that have none".into()));
+    }
     let mut metadata: BTreeMap<String, String> = card.settings.iter().cloned().collect();
     metadata.insert("licence".into(), args.licence.clone());
     metadata.insert("existence".into(), head.to_string());

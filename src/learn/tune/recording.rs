@@ -60,10 +60,10 @@ pub fn with_truth(folder: &Path, second_half: bool) -> Result<Recording, Dataset
     let labelled = dataset::load(folder)?;
     let path = folder.join("gt/gt.txt");
     let text =
-        fs::read_to_string(&path).map_err(|source| DatasetError::Read { path: path.clone(), source })?;
+        fs::read_to_string(&path).map_err(|reason| DatasetError::Read { path: path.clone(), reason })?;
     let length = labelled.frames.len();
     let truth =
-        parse_truth(&text, Some(length as u32)).map_err(|source| DatasetError::Rows { path, source })?;
+        parse_truth(&text, Some(length as u32)).map_err(|reason| DatasetError::Rows { path, reason })?;
     let skip = if second_half { first_half_length(length as u32) as usize } else { 0 };
     let least = TrackerConfig::default().association.high_score;
 
@@ -98,12 +98,12 @@ pub fn with_truth(folder: &Path, second_half: bool) -> Result<Recording, Dataset
 pub fn without_truth(folder: &Path, second_half: bool) -> Result<Recording, DatasetError> {
     let read = |file: &str| {
         let path = folder.join(file);
-        fs::read_to_string(&path).map_err(|source| DatasetError::Read { path, source })
+        fs::read_to_string(&path).map_err(|reason| DatasetError::Read { path, reason })
     };
     let info = SequenceInfo::parse(&read("seqinfo.ini")?)
-        .map_err(|source| DatasetError::Info { path: folder.join("seqinfo.ini"), source })?;
+        .map_err(|reason| DatasetError::Info { path: folder.join("seqinfo.ini"), reason })?;
     let mut sequence = Sequence::parse(info, &read("det/det.txt")?)
-        .map_err(|source| DatasetError::Rows { path: folder.join("det/det.txt"), source })?;
+        .map_err(|reason| DatasetError::Rows { path: folder.join("det/det.txt"), reason })?;
     if second_half {
         sequence = sequence.second_half();
     }
@@ -150,7 +150,7 @@ pub fn folders_without_truth(root: &Path) -> Result<Vec<PathBuf>, DatasetError> 
     if is_sequence(&root) {
         return Ok(vec![root]);
     }
-    let wrong = |source| DatasetError::Read { path: root.clone(), source };
+    let wrong = |reason| DatasetError::Read { path: root.clone(), reason };
     let entries = fs::read_dir(&root).map_err(wrong)?.collect::<Result<Vec<_>, _>>().map_err(wrong)?;
     let mut found: Vec<PathBuf> = entries.iter().map(fs::DirEntry::path).filter(is_sequence).collect();
     found.sort();
