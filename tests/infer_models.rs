@@ -12,7 +12,7 @@ use futures::future::join_all;
 use gakp::infer::bench::{FrameWork, models_alone};
 use gakp::infer::{InferError, ModelSettings, Models, ProviderChoice};
 use gakp::track::features::relative;
-use gakp::track::{Features, HISTORY, LinkRequest, Pair};
+use gakp::track::{AppearanceConfig, Features, HISTORY, LinkRequest, Pair, TrackerConfig};
 use gakp::types::{BBox, ClassId, Image, YuvRange};
 use infer_support::{decode, fixture, image, models, settings, sha256};
 
@@ -173,6 +173,27 @@ fn appearance_is_that_of_the_box() {
         assert!((value - expected).abs() < 0.01, "{block:?}");
     }
     assert!(block.cosine(found[5].as_ref().expect("its middle")) > 0.9999);
+}
+
+#[test]
+fn an_appearance_network_counts_though_nobody_calibrated_it() {
+    let Some((folder, settings)) = small() else { return };
+    let weight = |settings: &ModelSettings| {
+        let models = load(settings);
+        let appearance = models.calibrate(TrackerConfig::default()).appearance;
+        models.shutdown();
+        (appearance.weight, appearance.pivot)
+    };
+    let deep = AppearanceConfig::deep();
+    assert_eq!(weight(&settings), (deep.weight, deep.pivot));
+    assert_eq!(weight(&ModelSettings { reid: "none".into(), ..settings.clone() }).0, 0.0);
+    let file = folder.path().join("manifest.toml");
+    let text = fs::read_to_string(&file).expect("the manifest");
+    let width = "            width = 3\n";
+    assert!(text.contains(width));
+    let calibrated = text.replace(width, "width = 3\n[model.output.tracking]\nappearance_weight = 3.5\n");
+    fs::write(&file, calibrated).expect("written");
+    assert_eq!(weight(&settings), (3.5, AppearanceConfig::default().pivot), "its own word counts");
 }
 
 #[test]

@@ -11,7 +11,7 @@ use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use super::InferError;
-use crate::track::TrackerConfig;
+use crate::track::{AppearanceConfig, TrackerConfig};
 
 /// A manifest and the folder it lies in.
 #[derive(Clone, Debug)]
@@ -208,13 +208,23 @@ pub struct Calibration {
     pub high_score: Option<f64>,
     /// `detect`: least score of a birth.
     pub birth_score: Option<f64>,
-    /// `reid`: logits that a unit of cosine similarity is worth.
+    /// `reid`: logits that a unit of cosine similarity is worth. Where neither this nor the pivot is given,
+    /// [`AppearanceConfig::deep`] says both.
     pub appearance_weight: Option<f64>,
     /// `reid`: the cosine similarity that says nothing either way.
     pub appearance_pivot: Option<f64>,
 }
 
 impl Calibration {
+    /// What is usual of deep ReID networks where the entry says nothing of appearance.
+    pub(super) fn or_deep(mut self) -> Self {
+        if self.appearance_weight.is_none() && self.appearance_pivot.is_none() {
+            let AppearanceConfig { weight, pivot, .. } = AppearanceConfig::deep();
+            (self.appearance_weight, self.appearance_pivot) = (Some(weight), Some(pivot));
+        }
+        self
+    }
+
     /// `tracker` with what is known of the model.
     pub fn apply(&self, tracker: &mut TrackerConfig) {
         for (value, into) in [

@@ -140,7 +140,7 @@ impl Models {
         let appearance = match &plan.reid {
             Reid::None => Calibration::default(),
             Reid::Stripes => crate::embed::stripes::CALIBRATION,
-            Reid::Network(chosen) => calibrated(chosen),
+            Reid::Network(chosen) => calibrated(chosen).or_deep(),
         };
         let calibration = [calibrated(&plan.detector), appearance];
         Ok(Self { detector, embedder, linker, report: Arc::new(report), calibration })
