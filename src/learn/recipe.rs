@@ -4,6 +4,9 @@ use super::dataset::{LabelledSequence, Variant, vary};
 use super::examples::{Examples, Split};
 use super::teacher::Teacher;
 
+/// How often copies are made at most.
+pub const ROUNDS: usize = 8;
+
 /// How examples are made of sequences.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Recipe {
@@ -12,7 +15,8 @@ pub struct Recipe {
     /// Copies made of every sequence.
     pub variants: Vec<Variant>,
     /// Examples wanted. Every copy of every sequence gives an equal part, so that a crowded one does
-    /// not outvote the others; a short one may have fewer.
+    /// not outvote the others; a short one may have fewer. Where not even half of them come together, the
+    /// copies are made again, up to [`ROUNDS`] times in all: other detections are lost in each.
     pub examples: usize,
     /// Share of them to validate on: those of the last part of every sequence.
     pub validation: f64,
@@ -39,7 +43,7 @@ impl Default for Recipe {
 }
 
 impl Recipe {
-    /// Makes the examples; `tell` hears of every copy that is done.
+    /// Makes the examples; `tell` hears of every copy that is done in each round.
     pub fn collect(&self, sequences: &[&LabelledSequence], mut tell: impl FnMut()) -> Split {
         let mut rng = fastrand::Rng::with_seed(self.seed);
         let features = self.teacher.features;
@@ -47,16 +51,21 @@ impl Recipe {
         let copies = (sequences.len() * self.variants.len()).max(1);
         let wanted = self.examples.div_ceil(copies);
         let later = (wanted as f64 * self.validation).round() as usize;
-        for sequence in sequences {
-            for variant in &self.variants {
-                let copy = vary(sequence, variant, &mut rng);
-                let mut found = Examples::of(features);
-                self.teacher.collect(&copy, &mut rng, &mut found);
-                // Examples lie in the order of their frames.
-                let end = found.len() - (found.len() as f64 * self.validation).round() as usize;
-                all.training.append(&found.choose(0..end, wanted - later, &mut rng));
-                all.validation.append(&found.choose(end..found.len(), later, &mut rng));
-                tell();
+        for round in 0..ROUNDS {
+            if round > 0 && 2 * all.training.len() >= self.examples {
+                break;
+            }
+            for sequence in sequences {
+                for variant in &self.variants {
+                    let copy = vary(sequence, variant, &mut rng);
+                    let mut found = Examples::of(features);
+                    self.teacher.collect(&copy, &mut rng, &mut found);
+                    // Examples lie in the order of their frames.
+                    let end = found.len() - (found.len() as f64 * self.validation).round() as usize;
+                    all.training.append(&found.choose(0..end, wanted - later, &mut rng));
+                    all.validation.append(&found.choose(end..found.len(), later, &mut rng));
+                    tell();
+                }
             }
         }
         all
