@@ -83,6 +83,8 @@ pub struct TrackerOptions {
     pub lost_s: Option<f64>,
     /// Whether the camera may move.
     pub camera_motion: Option<bool>,
+    /// Whether its motion is looked for in the pictures; otherwise the boxes alone tell it.
+    pub picture_motion: Option<bool>,
     /// How pairs are judged: `iou`, `iou-motion`, `deep`, `explicit`, `explicit-fixed`, `implicit`, `huang`,
     /// `mahalanobis`; see [`crate::track::association`].
     pub association: Option<String>,
@@ -96,7 +98,8 @@ pub struct TrackerOptions {
     pub gate: Option<f64>,
     /// Gate by the paper's literal `H P H'` instead of the innovation covariance.
     pub literal_gate: Option<bool>,
-    /// Logits that a unit of cosine similarity moves the link probability by; 0 ignores appearance.
+    /// Logits that a unit of cosine similarity moves the link probability by; 0 ignores appearance. A link
+    /// network that reads embeddings itself is left alone.
     pub appearance_weight: Option<f64>,
     /// The cosine similarity that says nothing either way.
     pub appearance_pivot: Option<f64>,
@@ -273,6 +276,9 @@ impl TrackerOptions {
         }
         if let Some(moves) = self.camera_motion {
             base.shift.enabled = moves;
+        }
+        if let Some(look) = self.picture_motion {
+            base.shift.picture = look;
         }
         if let Some(name) = &self.association {
             base.association.method = name.parse::<Association>().context("tracker.association")?;

@@ -13,6 +13,8 @@
 
 pub mod types;
 
+#[cfg(feature = "service")]
+pub mod egomotion;
 #[cfg(feature = "ingest")]
 pub mod ingest;
 

@@ -193,7 +193,7 @@ fn an_appearance_network_counts_though_nobody_calibrated_it() {
     assert!(text.contains(width));
     let calibrated = text.replace(width, "width = 3\n[model.output.tracking]\nappearance_weight = 3.5\n");
     fs::write(&file, calibrated).expect("written");
-    assert_eq!(weight(&settings), (3.5, AppearanceConfig::default().pivot), "its own word counts");
+    assert_eq!(weight(&settings), (3.5, deep.pivot), "its own word counts");
 }
 
 #[test]

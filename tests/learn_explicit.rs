@@ -12,7 +12,7 @@ use gakp::track::association::explicit::COSTS;
 use gakp::track::features::{appearance, relative};
 use gakp::track::{Features, HISTORY, LinkRequest};
 
-const FEATURES: [Features; 2] = [Features::Relative, Features::Appearance];
+const FEATURES: [Features; 2] = [Features::Relative, Features::Appearance { embedding: 7 }];
 use learn_common::request;
 
 /// Requests whose columns are what they are in the tracker: an IoU, a distance, a time.
@@ -24,7 +24,7 @@ fn real(features: Features, tracks: usize, pairs: usize, rng: &mut fastrand::Rng
         row[relative::DT] = 0.04 * (1 + rng.u32(0..5)) as f32;
         row[relative::INNOVATION] = 0.2 * (rng.f32() - 0.5);
         row[relative::INNOVATION + 1] = 0.2 * (rng.f32() - 0.5);
-        if features == Features::Appearance {
+        if features.see_appearance() {
             row[appearance::MEAN_COSINE] = rng.f32();
             row[appearance::KNOWN] = f32::from(rng.u8(0..2));
         }

@@ -63,7 +63,7 @@ fn gradients_equal(features: Features) {
 #[test]
 fn learns_what_only_the_first_observation_tells() {
     // With one W for all steps, observations and candidate look alike: too hard for so few examples.
-    for features in [Features::Relative, Features::Appearance] {
+    for features in [Features::Relative, Features::Appearance { embedding: 7 }] {
         learns(features);
     }
 }

@@ -171,7 +171,7 @@ fn trains_every_kind_of_features() {
     };
     for (name, features, hidden) in [
         ("relative", Features::Relative, 32),
-        ("appearance", Features::Appearance, 32),
+        ("appearance", Features::Appearance { embedding: 8 }, 32),
         ("literal", Features::Literal { embedding: 8 }, 134),
         ("spatial", Features::Literal { embedding: 0 }, 134),
     ] {
@@ -191,8 +191,14 @@ fn trains_every_kind_of_features() {
     );
     let (_, metadata) = trained(&format!("{first} {walk} --features appearance --simulate-looks"));
     assert_eq!(metadata["embeddings"], "simulated for sequences that have none");
+    let (_, metadata) = trained(&format!("{first} {second} --features appearance --simulate-looks"));
+    assert!(!metadata.contains_key("embeddings"), "none had to be simulated");
     let message = refused(&format!("{walk} --features literal --simulate-looks"));
     assert!(message.contains("no sequence has a usable embedding"), "{message}");
+    let message = refused(&format!("{first} {walk} --features relative --simulate-looks"));
+    assert!(message.contains("--features relative does not look at embeddings"), "{message}");
+    let message = refused(&format!("{first} {walk} --features appearance --simulate-looks --loso"));
+    assert!(message.contains("without MOT17-01: --loso TEXT"), "{message}");
     let message = refused(&format!("{first} --features literal --association explicit"));
     assert!(message.contains("--features relative or appearance, not literal"), "{message}");
     write_features(&root.path().join("MOT17-02-A"), 9);
@@ -205,6 +211,7 @@ fn trains_every_kind_of_features() {
 #[test]
 fn refuses_what_it_cannot_use() {
     let root = world();
+    write_sequence(&root.path().join("halves"), "MOT17-02a-A", 0.03);
     let data = root.path().display().to_string();
     let refused = |text: &str| format!("{:#}", train::run(args(text)).expect_err("refused"));
     let out = format!("--out {data}/x.onnx");
@@ -213,6 +220,7 @@ fn refuses_what_it_cannot_use() {
         (format!("{data}/walk/gt {out}"), "expected folders SEQ/"),
         (format!("{data} {out} --exclude MOT99"), "no sequence has that in its name"),
         (format!("{data} {data}/walk {out}"), "walk is given twice"),
+        (format!("{data} {data}/halves/MOT17-02a-A {out}"), "MOT17-02a-A is half of the footage of"),
         (format!("{data} --out {data}/no/folder/x.onnx --examples 1000 --epochs 1"), "cannot write"),
     ] {
         let message = refused(&text);

@@ -219,9 +219,13 @@ fn halves_are_the_sequence() {
     assert_eq!(features("a").row(1), [4.0, -1.0, 5.0, 6.0, 7.0, 8.0, 0.9, 0.4, 0.5]);
     assert_eq!(features("b").row(1)[..2], [3.0, -1.0], "the frame of the half");
 
+    let refused = |out: &Path| {
+        let output = split(&[&sequence, Path::new("--out"), out]);
+        assert_eq!(output.status.code(), Some(2));
+        String::from_utf8_lossy(&output.stderr).into_owned()
+    };
+    assert!(refused(&out).contains("MOT17-77a-X is there already"), "nothing is overwritten");
     write("det/det_features.npy", b"x");
-    let output = split(&[&sequence, Path::new("--out"), &out]);
-    let message = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(2));
+    let message = refused(&folder.path().join("more"));
     assert!(message.contains("MOT17-77-X: det/det_features.npy: not a NumPy array file"), "{message}");
 }

@@ -37,6 +37,7 @@ fn track(config: TrackerConfig, frames: &[Vec<(Detection, Option<Embedding>)>]) 
             height: 720.0,
             detections: &detections,
             embeddings: &embeddings,
+            shift: None,
         };
         tracker.predict(frame, &mut request);
         assert!(asks || request.is_empty(), "nobody is asked");
@@ -163,6 +164,7 @@ fn scores_that_nobody_asked_for_are_refused() {
             height: 480.0,
             detections: &detections,
             embeddings: &[],
+            shift: None,
         };
         tracker.predict(frame, &mut request);
         if tracker.pairs().is_empty() {

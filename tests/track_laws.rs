@@ -1,6 +1,7 @@
 //! Laws of the tracking core, with a scorer made of geometry alone: no model, no file, no clock.
 
 use gakp::track::features::relative;
+use gakp::track::shift::Shift;
 use gakp::track::{FrameInput, LinkRequest, TrackError, Tracker, TrackerConfig, Update};
 use gakp::types::{BBox, Detection, MediaTime, TrackId, TrackState};
 use proptest::prelude::*;
@@ -22,6 +23,7 @@ fn step(tracker: &mut Tracker, seconds: f64, detections: &[Detection]) -> Update
         height: SIZE.1,
         detections,
         embeddings: &[],
+        shift: None,
     };
     tracker.predict(frame, &mut request);
     tracker.update(&geometry(&request)).expect("a score for each pair")
@@ -111,6 +113,36 @@ fn a_camera_that_jumps_takes_its_tracks_along() {
 }
 
 #[test]
+fn a_shift_that_the_picture_tells_moves_the_tracks_and_silences_the_boxes() {
+    let predicted = |shift: Option<Shift>, enabled: bool| {
+        let mut config = TrackerConfig::default();
+        config.shift.enabled = enabled;
+        let mut tracker = Tracker::new(config);
+        let crowd: Vec<Detection> = (0..4).map(|i| person(100.0 + 90.0 * f64::from(i), 200.0)).collect();
+        for frame in 0..10 {
+            step(&mut tracker, f64::from(frame) / 25.0, &crowd);
+        }
+        // Boxes say 12 pixels to the right.
+        let moved: Vec<Detection> =
+            crowd.iter().map(|d| Detection::person(d.bbox.shifted(12.0, 0.0), 0.9)).collect();
+        let time = MediaTime::from_secs(0.4);
+        let (width, height) = SIZE;
+        let frame = FrameInput { time, width, height, detections: &moved, embeddings: &[], shift };
+        tracker.predict(frame, &mut LinkRequest::default());
+        (tracker.predicted()[0].cx() - 100.0, tracker.predicted()[0].cy() - 200.0)
+    };
+    let near = |(x, y): (f64, f64), [dx, dy]: [f64; 2]| (x - dx).abs() < 1.0 && (y - dy).abs() < 1.0;
+    let told = Some(Shift { by: [30.0, -10.0], variance: [0.1; 2] });
+    assert!(near(predicted(told, true), [30.0, -10.0]), "{:?}", predicted(told, true));
+    assert!(
+        near(predicted(Some(Shift::default()), true), [0.0, 0.0]),
+        "a camera that is seen to stand still"
+    );
+    assert!((predicted(None, true).0 - 12.0).abs() < 2.0, "the boxes are all there is");
+    assert!(near(predicted(told, false), [0.0, 0.0]), "switched off");
+}
+
+#[test]
 fn half_the_frames_give_the_same_tracks() {
     let run = |keep: usize| {
         let mut tracker = Tracker::new(TrackerConfig::default());
@@ -146,6 +178,7 @@ fn misuse_is_told() {
         height: SIZE.1,
         detections: &detections,
         embeddings: &[],
+        shift: None,
     };
     tracker.predict(frame, &mut request);
     assert_eq!(request.pairs.len(), 1);

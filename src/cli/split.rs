@@ -67,6 +67,7 @@ fn split(folder: &Path, out: &Path) -> Result<()> {
     for (letter, frames) in [("a", 0..first), ("b", first..info.length)] {
         let name = format!("{of}{letter}{}", &name[of.len()..]);
         let to = out.join(&name);
+        ensure!(!to.exists(), "{} is there already: give an empty folder", to.display());
         let info = SequenceInfo { name: name.clone(), length: frames.len() as u32, ..info.clone() };
         let kept = |row: &Row| frames.contains(&(row.frame - 1));
         write(&to.join("seqinfo.ini"), info.write().as_bytes())?;

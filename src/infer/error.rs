@@ -72,9 +72,9 @@ pub enum InferError {
     },
     /// A link scorer that reads other embeddings than there are.
     #[error(
-        "model {name:?} reads embeddings of {expected} numbers, and there are {}: \
-         set --reid (models.reid) or --features to what it was trained with, or --link to another network",
-        width.map_or("none".into(), |width| format!("some of {width}"))
+        "model {name:?} reads embeddings of {expected} numbers, and {}: give it the appearance that it was trained \
+         with (models.reid, --reid; for a sequence det/det_features.npy and --features), or another --link",
+        width.map_or("there are none".into(), |width| format!("these have {width}"))
     )]
     Embeddings {
         /// Its name in the manifest.

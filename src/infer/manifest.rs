@@ -208,21 +208,21 @@ pub struct Calibration {
     pub high_score: Option<f64>,
     /// `detect`: least score of a birth.
     pub birth_score: Option<f64>,
-    /// `reid`: logits that a unit of cosine similarity is worth. Where neither this nor the pivot is given,
-    /// [`AppearanceConfig::deep`] says both.
+    /// `reid`: logits that a unit of cosine similarity is worth; [`AppearanceConfig::deep`]'s without.
     pub appearance_weight: Option<f64>,
-    /// `reid`: the cosine similarity that says nothing either way.
+    /// `reid`: the cosine similarity that says nothing either way; [`AppearanceConfig::deep`]'s without.
     pub appearance_pivot: Option<f64>,
 }
 
 impl Calibration {
-    /// What is usual of deep ReID networks where the entry says nothing of appearance.
-    pub(super) fn or_deep(mut self) -> Self {
-        if self.appearance_weight.is_none() && self.appearance_pivot.is_none() {
-            let AppearanceConfig { weight, pivot, .. } = AppearanceConfig::deep();
-            (self.appearance_weight, self.appearance_pivot) = (Some(weight), Some(pivot));
+    /// What is usual of deep ReID networks for what the entry does not say.
+    pub(super) fn or_deep(self) -> Self {
+        let AppearanceConfig { weight, pivot, .. } = AppearanceConfig::deep();
+        Self {
+            appearance_weight: self.appearance_weight.or(Some(weight)),
+            appearance_pivot: self.appearance_pivot.or(Some(pivot)),
+            ..self
         }
-        self
     }
 
     /// `tracker` with what is known of the model.

@@ -73,10 +73,11 @@ impl Card {
         let mut out = String::new();
         let sees = match self.features {
             Features::Relative => "Boxes only: it sees neither pixels nor the place in the picture.".into(),
-            Features::Appearance => {
-                "Boxes, not their place in the picture, and how alike embeddings are: it \
-                                     is good for embeddings of the kind that it was trained on."
-                    .into()
+            Features::Appearance { embedding } => {
+                format!(
+                    "Boxes, not their place in the picture, and how alike embeddings of {embedding} numbers \
+                     are: it is good for embeddings of the kind that it was trained on."
+                )
             }
             Features::Literal { embedding } => {
                 format!("Boxes with their place in the picture and embeddings of {embedding} numbers.")

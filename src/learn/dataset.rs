@@ -66,6 +66,13 @@ pub struct LabelledSequence {
     pub frames: Vec<LabelledFrame>,
 }
 
+impl LabelledSequence {
+    /// Whether it is known what its detections look like.
+    pub fn has_embeddings(&self) -> bool {
+        self.frames.iter().any(|frame| !frame.embeddings.is_empty())
+    }
+}
+
 /// Why training data cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum DatasetError {

@@ -72,7 +72,7 @@ impl Boxes {
         let mut request = LinkRequest::default();
         for ((frame, people), neutral) in sequence.frames.iter().zip(&people).zip(&neutral) {
             let LabelledFrame { time, detections, embeddings, .. } = frame;
-            let input = FrameInput { time: *time, width, height, detections, embeddings };
+            let input = FrameInput { time: *time, width, height, detections, embeddings, shift: None };
             tracker.predict(input, &mut request);
             let links = if request.is_empty() { vec![] } else { score(&request) };
             if tracker.update(&links).is_err() {

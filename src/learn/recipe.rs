@@ -43,16 +43,18 @@ impl Default for Recipe {
 }
 
 impl Recipe {
-    /// Makes the examples; `tell` hears of every copy that is done in each round.
-    pub fn collect(&self, sequences: &[&LabelledSequence], mut tell: impl FnMut()) -> Split {
+    /// Makes the examples; `tell` hears of every copy that is done: how many, of how many so far.
+    pub fn collect(&self, sequences: &[&LabelledSequence], mut tell: impl FnMut(usize, usize)) -> Split {
         let mut rng = fastrand::Rng::with_seed(self.seed);
         let features = self.teacher.features;
         let mut all = Split { training: Examples::of(features), validation: Examples::of(features) };
         let copies = (sequences.len() * self.variants.len()).max(1);
         let wanted = self.examples.div_ceil(copies);
         let later = (wanted as f64 * self.validation).round() as usize;
+        let mut done = 0;
         for round in 0..ROUNDS {
-            if round > 0 && 2 * all.training.len() >= self.examples {
+            let found = all.training.len();
+            if round > 0 && (found == 0 || 2 * found >= self.examples) {
                 break;
             }
             for sequence in sequences {
@@ -64,7 +66,8 @@ impl Recipe {
                     let end = found.len() - (found.len() as f64 * self.validation).round() as usize;
                     all.training.append(&found.choose(0..end, wanted - later, &mut rng));
                     all.validation.append(&found.choose(end..found.len(), later, &mut rng));
-                    tell();
+                    done += 1;
+                    tell(done, copies * (round + 1));
                 }
             }
         }

@@ -109,6 +109,7 @@ impl Teacher {
                 height,
                 detections: &detections,
                 embeddings: &embeddings,
+                shift: None,
             };
             tracker.predict(input, &mut request);
 

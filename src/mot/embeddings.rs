@@ -7,6 +7,7 @@ use crate::types::Embedding;
 /// Embeddings of a sequence: of every frame one entry a detection, as [`super::Sequence`] has them.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SequenceEmbeddings {
+    width: Option<usize>,
     frames: Vec<Vec<Option<Embedding>>>,
 }
 
@@ -81,7 +82,7 @@ impl SequenceEmbeddings {
                 frames[row.frame as usize - 1].push(Embedding::normalised(vector));
             }
         }
-        Ok(Self { frames })
+        Ok(Self { width: Some(matrix.columns - skip), frames })
     }
 
     /// The embeddings of a 0-based frame's detections; none past the end.
@@ -89,9 +90,9 @@ impl SequenceEmbeddings {
         self.frames.get(index).map_or(&[], Vec::as_slice)
     }
 
-    /// Numbers in an embedding; `None` where there is none.
+    /// Numbers in an embedding; `None` where no file was read.
     pub fn width(&self) -> Option<usize> {
-        self.frames.iter().flatten().flatten().next().map(|embedding| embedding.as_slice().len())
+        self.width
     }
 
     /// Those of the frames after [`first_half_length`], as [`super::Sequence::second_half`].
@@ -146,7 +147,7 @@ mod tests {
             // The box without an area is no detection; the vector without a length no appearance.
             assert_eq!(found.frame(1)[1], None);
             assert!(found.frame(9).is_empty());
-            assert_eq!(found.second_half(), SequenceEmbeddings { frames: vec![vec![]] });
+            assert_eq!(found.second_half(), SequenceEmbeddings { width: Some(2), frames: vec![vec![]] });
         }
     }
 

@@ -26,6 +26,7 @@ pub fn replay<E>(
             height: f64::from(sequence.info.height),
             detections,
             embeddings: &embeddings,
+            shift: None,
         };
         tracker.predict(frame, &mut request);
         let links = if request.is_empty() { Vec::new() } else { score(&request)? };

@@ -13,9 +13,11 @@ use tokio::sync::{mpsc, oneshot};
 use super::embed::Embedded;
 use super::link::LinkJob;
 use super::outlet::Outlet;
+use crate::egomotion::Egomotion;
 use crate::infer::InferError;
 use crate::publish::Picture;
 use crate::telemetry::{CameraMetrics, DropReason, Metrics, Stage};
+use crate::track::shift::Shift;
 use crate::track::{FrameInput, LinkRequest, Tracker, TrackerConfig, Update};
 use crate::types::{CameraId, Clock, Epoch, FrameTracks, TrackState};
 
@@ -138,6 +140,8 @@ struct Desk {
     camera: CameraId,
     epoch: Epoch,
     tracker: Tracker,
+    /// Looks for the camera's motion in the pictures, unless that is switched off.
+    egomotion: Option<Egomotion>,
     outlet: Box<dyn Outlet>,
     metrics: Arc<CameraMetrics>,
     seq: u64,
@@ -166,10 +170,21 @@ impl Worker {
             match message {
                 ToTracker::Attach(seat) => {
                     let NewSeat { slot, camera, epoch, config, outlet, metrics } = *seat;
+                    let egomotion = (config.shift.enabled && config.shift.picture).then(Egomotion::default);
                     let tracker = Tracker::new(config);
                     let (backlog, in_hand, leaving) = (VecDeque::new(), None, None);
-                    let desk =
-                        Desk { camera, epoch, tracker, outlet, metrics, seq: 0, backlog, in_hand, leaving };
+                    let desk = Desk {
+                        camera,
+                        epoch,
+                        tracker,
+                        egomotion,
+                        outlet,
+                        metrics,
+                        seq: 0,
+                        backlog,
+                        in_hand,
+                        leaving,
+                    };
                     self.seats.insert(slot, desk);
                 }
                 ToTracker::Frame(slot, frame) => {
@@ -204,7 +219,8 @@ impl Worker {
             let start = Instant::now();
             // Moves into the link job, so it cannot be kept.
             let mut request = LinkRequest::default();
-            desk.tracker.predict(input(&frame), &mut request);
+            let shift = desk.egomotion.as_mut().and_then(|e| e.next(&frame.frame.image));
+            desk.tracker.predict(input(&frame, shift), &mut request);
             let predicted_in = start.elapsed();
             let asked = Instant::now();
             let empty = request.is_empty();
@@ -287,12 +303,13 @@ impl Desk {
     }
 }
 
-fn input(frame: &Embedded) -> FrameInput<'_> {
+fn input(frame: &Embedded, shift: Option<Shift>) -> FrameInput<'_> {
     FrameInput {
         time: frame.frame.time,
         width: f64::from(frame.frame.image.width),
         height: f64::from(frame.frame.image.height),
         detections: &frame.detections,
         embeddings: &frame.embeddings,
+        shift,
     }
 }

@@ -262,6 +262,8 @@ impl AppearanceConfig {
 pub struct ShiftConfig {
     /// Off for cameras known to be fixed.
     pub enabled: bool,
+    /// Whether whoever has the pictures should look for it there first.
+    pub picture: bool,
     /// Least IoU of a pair that takes part.
     pub min_iou: f64,
     /// Least number of pairs.
@@ -274,7 +276,7 @@ pub struct ShiftConfig {
 
 impl Default for ShiftConfig {
     fn default() -> Self {
-        Self { enabled: true, min_iou: 0.25, min_pairs: 3, shrink: 0.3, min_hits: 3 }
+        Self { enabled: true, picture: true, min_iou: 0.25, min_pairs: 3, shrink: 0.3, min_hits: 3 }
     }
 }
 

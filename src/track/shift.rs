@@ -58,7 +58,7 @@ pub fn global_shift(config: &ShiftConfig, predicted: &[BBox], detections: &Nearb
 }
 
 /// Median of a non-empty slice, which it reorders.
-fn median(values: &mut [f64]) -> f64 {
+pub(crate) fn median(values: &mut [f64]) -> f64 {
     values.sort_by(f64::total_cmp);
     let mid = values.len() / 2;
     if values.len() % 2 == 1 { values[mid] } else { (values[mid - 1] + values[mid]) / 2.0 }

@@ -8,7 +8,7 @@ use super::link::{LinkRequest, Pair};
 use super::motion::Step;
 use super::nearby::Nearby;
 use super::pair::PairView;
-use super::shift::global_shift;
+use super::shift::{Shift, global_shift};
 use super::tracklet::Tracklet;
 use crate::types::{BBox, Detection, Embedding, MediaTime, TrackId, TrackReport};
 
@@ -29,6 +29,9 @@ pub struct FrameInput<'a> {
     pub detections: &'a [Detection],
     /// The detections' embeddings: empty, or one entry a detection.
     pub embeddings: &'a [Option<Embedding>],
+    /// The camera's shift since the frame that was predicted last, where the picture tells it; otherwise the
+    /// boxes may.
+    pub shift: Option<Shift>,
 }
 
 /// What the tracker says about the frame that it was just given.
@@ -147,7 +150,7 @@ impl Tracker {
         for track in &mut self.tracks {
             track.predict(time, &step);
         }
-        self.follow_camera();
+        self.follow_camera(frame.shift);
         for track in &mut self.tracks {
             track.matched = false;
         }
@@ -276,16 +279,19 @@ impl Tracker {
         self.high.fill(boxes.filter(|(_, (score, _))| *score >= high).map(|(i, (_, bbox))| (i, bbox)));
     }
 
-    /// Moves every track by the camera's own motion.
-    fn follow_camera(&mut self) {
+    /// Moves every track by the camera's own motion, which the picture has told or the boxes tell.
+    fn follow_camera(&mut self, told: Option<Shift>) {
         let config = &self.config.shift;
+        if !config.enabled {
+            return;
+        }
         let seen: Vec<BBox> = self
             .tracks
             .iter()
             .filter(|t| t.matched && t.hits >= config.min_hits)
             .map(Tracklet::bbox)
             .collect();
-        if let Some(shift) = global_shift(config, &seen, &self.high) {
+        if let Some(shift) = told.or_else(|| global_shift(config, &seen, &self.high)) {
             for track in &mut self.tracks {
                 track.shift(&shift);
             }

@@ -6,7 +6,7 @@ use gakp::track::{Features, HISTORY, LinkRequest, Pair};
 /// One of each kind; the last is the paper's spatial features alone.
 pub const FEATURES: [Features; 4] = [
     Features::Relative,
-    Features::Appearance,
+    Features::Appearance { embedding: 7 },
     Features::Literal { embedding: 9 },
     Features::Literal { embedding: 0 },
 ];

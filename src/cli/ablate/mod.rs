@@ -32,7 +32,8 @@ pub struct Args {
     root: PathBuf,
     /// Folder of networks that leave one footage out, DIR/FOOTAGE.onnx, as `gakp train --loso` writes
     /// them; several times, for each kind of network (--association and --features of `gakp train`).
-    /// Without, --link names one network for everything.
+    /// Without, --link names one network for everything. All rows have the filter and the existence head of
+    /// the first kind that there is for the footage: implicit, explicit, then those that see appearance.
     #[arg(long, value_name = "DIR")]
     links: Vec<PathBuf>,
     /// Only sequences whose names end in -SUFFIX; several, with commas between, in this order.

@@ -39,10 +39,10 @@ impl Kind {
 
     fn of(linker: &Linker) -> Self {
         match (linker.association(), linker.features()) {
-            (Association::Explicit, Features::Appearance) => Kind::ExplicitLooks,
+            (Association::Explicit, Features::Appearance { .. }) => Kind::ExplicitLooks,
             (Association::Explicit, _) => Kind::Explicit,
             (_, Features::Relative) => Kind::Implicit,
-            (_, Features::Appearance) => Kind::ImplicitLooks,
+            (_, Features::Appearance { .. }) => Kind::ImplicitLooks,
             (_, Features::Literal { embedding: 0 }) => Kind::Spatial,
             (_, Features::Literal { .. }) => Kind::Literal,
         }

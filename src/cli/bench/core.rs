@@ -59,6 +59,11 @@ pub fn run(args: Args) -> Result<()> {
     }
     let mut linker = LinkAlone::load(&settings)?;
     let ways = Way::all(&linker);
+    let features = linker.calibrate(TrackerConfig::default()).association.features;
+    ensure!(
+        !features.see_appearance(),
+        "the link network reads embeddings ({features}), and this bench has none: give --link one of boxes alone"
+    );
     let mut report = Report { rounds: args.rounds, sets: vec![], crowd: vec![] };
     for det in &args.det {
         let half = args.second_half.contains(det);
@@ -157,6 +162,7 @@ fn track(way: &Way, frames: &Frames, warm_up: usize, linker: &mut LinkAlone) -> 
             height: frames.size.1,
             detections,
             embeddings: &[],
+            shift: None,
         };
         let start = Instant::now();
         tracker.predict(frame, &mut request);

@@ -158,6 +158,7 @@ fn frame_work(frames: &[(Image, MediaTime)], settings: &ModelSettings) -> Result
             height: f64::from(image.height),
             detections: &detections,
             embeddings: &embeddings,
+            shift: None,
         };
         tracker.predict(input, &mut request);
         let links = if request.is_empty() { Vec::new() } else { linker.score_blocking(request.clone())? };

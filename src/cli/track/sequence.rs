@@ -21,6 +21,7 @@ pub fn track_all(inputs: &[String], out: &Path, job: &Job) -> Result<()> {
     // Every input is read before the first output is written.
     let sequences = inputs.iter().map(|folder| read(Path::new(folder), job)).collect::<Result<Vec<_>>>()?;
     let work = Work::new(job)?;
+    sequences.iter().try_for_each(|input| work.check(input))?;
     for (input, folder) in sequences.iter().zip(inputs) {
         let name = folder_name(Path::new(folder));
         work.track(input, &mut Output::create(&out.join(format!("{name}.txt")))?)?;
@@ -33,6 +34,7 @@ pub fn track_all(inputs: &[String], out: &Path, job: &Job) -> Result<()> {
 pub fn track(folder: &Path, job: &Job, out: &mut Output) -> Result<()> {
     let input = read(folder, job)?;
     let work = Work::new(job)?;
+    work.check(&input)?;
     work.track(&input, out)?;
     work.end();
     Ok(())
@@ -66,10 +68,13 @@ impl Work {
         Ok(Self { config, linker })
     }
 
+    /// Whether the link scorer can read what there is.
+    fn check(&self, Input { sequence, embeddings }: &Input) -> Result<()> {
+        let check = |linker: &Linker| linker.check_embeddings(embeddings.width());
+        self.linker.as_ref().map_or(Ok(()), check).with_context(|| sequence.info.name.clone())
+    }
+
     fn track(&self, Input { sequence, embeddings }: &Input, out: &mut Output) -> Result<()> {
-        if let Some(linker) = &self.linker {
-            linker.check_embeddings(embeddings.width())?;
-        }
         let bar = progress::frames(Some(sequence.detections.len() as u64), &sequence.info.name);
         let embeddings = |frame: usize| {
             bar.set_position(frame as u64 + 1);

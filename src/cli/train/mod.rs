@@ -131,6 +131,16 @@ pub fn run(args: Args) -> Result<()> {
         groups.retain(|g| g.contains(name.as_str()));
         groups.dedup();
         ensure!(!groups.is_empty(), "--loso {name:?}: no footage has that in its name");
+        if args.simulate_looks {
+            // Said before the first network is trained, not after hours at the last.
+            for group in &groups {
+                let seen: Vec<&Source> = sources.iter().filter(|s| s.labelled.group != *group).collect();
+                ensure!(
+                    looks_of(&seen).is_some(),
+                    "{NO_LOOKS} without {group}: --loso TEXT chooses the footage that is left out"
+                );
+            }
+        }
         fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
         for group in groups {
             let out = args.out.join(format!("{group}.onnx"));
@@ -168,6 +178,17 @@ fn load(roots: &[PathBuf]) -> Result<Vec<Source>> {
         }
     }
     sources.sort_by(|a, b| a.labelled.name.cmp(&b.labelled.name));
+    for half in &sources {
+        let group = &half.labelled.group;
+        let whole =
+            group.strip_suffix(['a', 'b']).and_then(|w| sources.iter().find(|s| s.labelled.group == w));
+        if let Some(whole) = whole {
+            let [half, whole] = [half, whole].map(|s| s.folder.display().to_string());
+            bail!(
+                "{half} is half of the footage of {whole}: give the halves or the whole, what is held out must not be seen"
+            );
+        }
+    }
     if let Some(pair) = sources.windows(2).find(|w| w[0].labelled.name == w[1].labelled.name) {
         let [a, b] = [&pair[0].folder, &pair[1].folder];
         bail!("sequence {} is given twice: {} and {}", pair[0].labelled.name, a.display(), b.display());
@@ -183,10 +204,15 @@ fn features(args: &Args, sources: &mut [Source]) -> Result<Features> {
         "--association explicit weighs what relative boxes give: --features relative or appearance, not {}",
         args.features
     );
+    ensure!(
+        !args.simulate_looks || ["appearance", "literal"].contains(&args.features.as_str()),
+        "--simulate-looks: --features {} does not look at embeddings; appearance and literal do",
+        args.features
+    );
     match args.features.as_str() {
         "spatial" => Ok(Features::Literal { embedding: 0 }),
         "literal" => Ok(Features::Literal { embedding: load_embeddings(args, sources)? }),
-        "appearance" => load_embeddings(args, sources).map(|_| Features::Appearance),
+        "appearance" => Ok(Features::Appearance { embedding: load_embeddings(args, sources)? }),
         _ => Ok(Features::Relative),
     }
 }
@@ -217,16 +243,24 @@ fn load_embeddings(args: &Args, sources: &mut [Source]) -> Result<usize> {
 
 /// The sequences, those without embeddings with simulated ones.
 fn dress(seen: &[&Source], seed: u64) -> Result<Vec<Source>> {
-    let bare = |sequence: &LabelledSequence| sequence.frames.iter().all(|frame| frame.embeddings.is_empty());
-    let known: Vec<&LabelledSequence> = seen.iter().map(|s| &s.labelled).filter(|s| !bare(s)).collect();
-    let looks = Looks::of(&known)
-        .context("--simulate-looks: none of the training sequences has embeddings of two people or more")?;
+    let looks = looks_of(seen).context(NO_LOOKS)?;
     let mut rng = fastrand::Rng::with_seed(seed);
     let mut dressed: Vec<Source> = seen.iter().copied().cloned().collect();
-    for Source { labelled, .. } in dressed.iter_mut().filter(|s| bare(&s.labelled)) {
+    for Source { labelled, .. } in dressed.iter_mut().filter(|s| !s.labelled.has_embeddings()) {
         looks.dress(labelled, &mut rng);
     }
     Ok(dressed)
+}
+
+/// Why looks cannot be simulated.
+const NO_LOOKS: &str =
+    "--simulate-looks: none of the training sequences has embeddings of two people or more";
+
+/// What can be learned of the looks of people.
+fn looks_of(seen: &[&Source]) -> Option<Looks> {
+    let known: Vec<&LabelledSequence> =
+        seen.iter().map(|s| &s.labelled).filter(|s| s.has_embeddings()).collect();
+    Looks::of(&known)
 }
 
 /// Width of the hidden state where none is given.
@@ -250,11 +284,9 @@ fn train(
 ) -> Result<Trained> {
     let (held, seen): (Vec<&Source>, Vec<&Source>) = sources.iter().partition(|s| held_out(&s.labelled));
     ensure!(!seen.is_empty(), "nothing to train on: every sequence is held out");
-    let dressed = match features.see_appearance() && args.simulate_looks {
-        true => dress(&seen, args.seed)?,
-        false => vec![],
-    };
-    let seen = if dressed.is_empty() { seen } else { dressed.iter().collect() };
+    let simulated = args.simulate_looks && seen.iter().any(|s| !s.labelled.has_embeddings());
+    let dressed = if simulated { dress(&seen, args.seed)? } else { vec![] };
+    let seen = if simulated { dressed.iter().collect() } else { seen };
     let name = out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     let (filter, filter_of) = filter(args, out)?;
     let tracker = TrackerConfig { filter, ..TrackerConfig::default() };
@@ -282,6 +314,10 @@ fn train(
 
     let mut scores = vec![];
     for source in &held {
+        if features.see_appearance() && !source.labelled.has_embeddings() {
+            println!("{name} {}: not scored, it has no embeddings", source.labelled.name);
+            continue;
+        }
         let found = tracked::score(&model, &tracker, &head, source, &args.second_half)?;
         println!(
             "{name} {}: {} pairs, AUC {:.4}, cross-entropy {:.4}, calibration error {:.4}; HOTA {:.2} MOTA {:.2} IDF1 {:.2} IDs {}",
@@ -313,7 +349,7 @@ fn train(
         settings: describe(&settings, &recipe, (&tracker.filter, filter_of)),
         unseen: known.iter().chain(&scores).cloned().collect(),
     };
-    if !dressed.is_empty() {
+    if simulated {
         card.settings.push(("embeddings".into(), "simulated for sequences that have none".into()));
     }
     let mut metadata: BTreeMap<String, String> = card.settings.iter().cloned().collect();
@@ -381,7 +417,10 @@ fn collect(recipe: &Recipe, seen: &[&Source], name: &str) -> Split {
     let sequences: Vec<&LabelledSequence> = seen.iter().map(|s| &s.labelled).collect();
     let bar = bar((sequences.len() * recipe.variants.len()) as u64, "{msg} {wide_bar} {pos}/{len}");
     bar.set_message(format!("{name}: examples"));
-    let examples = recipe.collect(&sequences, || bar.inc(1));
+    let examples = recipe.collect(&sequences, |done, of| {
+        bar.set_length(of as u64);
+        bar.set_position(done as u64);
+    });
     bar.finish_and_clear();
     examples
 }

@@ -115,7 +115,10 @@ pub fn without_truth(folder: &Path, second_half: bool) -> Result<Recording, Data
     for (frame, detections) in detections.iter().enumerate() {
         let time = MediaTime::from_secs(frame as f64 / info.frame_rate);
         let (width, height) = (f64::from(info.width), f64::from(info.height));
-        tracker.predict(FrameInput { time, width, height, detections, embeddings: &[] }, &mut request);
+        tracker.predict(
+            FrameInput { time, width, height, detections, embeddings: &[], shift: None },
+            &mut request,
+        );
         let links: Vec<f32> = tracker.pairs().iter().map(|pair| pair.geometry.iou as f32).collect();
         // The frame was predicted above and every pair has its link: neither step can fail.
         let Ok(decision) = tracker.decide(&links) else { continue };

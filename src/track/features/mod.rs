@@ -25,7 +25,10 @@ pub enum Features {
     #[default]
     Relative,
     /// [`appearance`]: boxes, and how alike track and detection look.
-    Appearance,
+    Appearance {
+        /// Numbers in an embedding of the kind that it was trained on.
+        embedding: usize,
+    },
     /// [`literal`]: embeddings themselves and normalised boxes.
     Literal {
         /// Numbers in an embedding; 0 leaves appearance out.
@@ -38,7 +41,7 @@ impl Features {
     pub const fn name(self) -> &'static str {
         match self {
             Features::Relative => "relative",
-            Features::Appearance => "appearance",
+            Features::Appearance { .. } => "appearance",
             Features::Literal { .. } => "literal",
         }
     }
@@ -46,7 +49,7 @@ impl Features {
     /// Width of an observation's row.
     pub const fn step(self) -> usize {
         match self {
-            Features::Relative | Features::Appearance => relative::STEP,
+            Features::Relative | Features::Appearance { .. } => relative::STEP,
             Features::Literal { embedding } => embedding + literal::SPATIAL,
         }
     }
@@ -55,7 +58,7 @@ impl Features {
     pub const fn candidate(self) -> usize {
         match self {
             Features::Relative => relative::CANDIDATE,
-            Features::Appearance => appearance::CANDIDATE,
+            Features::Appearance { .. } => appearance::CANDIDATE,
             Features::Literal { .. } => self.step(),
         }
     }
@@ -64,44 +67,49 @@ impl Features {
     pub const fn see_appearance(self) -> bool {
         match self {
             Features::Relative => false,
-            Features::Appearance => true,
+            Features::Appearance { .. } => true,
             Features::Literal { embedding } => embedding > 0,
         }
     }
 
-    /// Width that an embedding must have to be seen; `None`: any will do, or none is seen.
+    /// Width that embeddings must have; `None` where none is seen.
     pub const fn embedding(self) -> Option<usize> {
         match self {
+            Features::Appearance { embedding } => Some(embedding),
             Features::Literal { embedding } if embedding > 0 => Some(embedding),
             _ => None,
         }
     }
 }
 
-/// `relative`, `appearance`, or `literal N` with N numbers in an embedding.
+/// `relative`, `appearance N` or `literal N` with N numbers in an embedding.
 impl fmt::Display for Features {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Features::Literal { embedding } => write!(f, "{} {embedding}", self.name()),
-            _ => f.write_str(self.name()),
+            Features::Relative => f.write_str(self.name()),
+            Features::Appearance { embedding } | Features::Literal { embedding } => {
+                write!(f, "{} {embedding}", self.name())
+            }
         }
     }
 }
 
 /// A text that names no features.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{0:?} names no features: relative, appearance or \"literal N\" (N numbers in an embedding) do")]
+#[error(
+    "{0:?} names no features: \"relative\", \"appearance N\" and \"literal N\" (N numbers in an embedding) do"
+)]
 pub struct UnknownFeatures(String);
 
 impl FromStr for Features {
     type Err = UnknownFeatures;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let literal = |n: &str| Some(Features::Literal { embedding: n.parse().ok()? });
-        match text {
-            "relative" => Some(Features::Relative),
-            "appearance" => Some(Features::Appearance),
-            _ => text.strip_prefix("literal ").and_then(literal),
+        match text.split_once(' ') {
+            None if text == "relative" => Some(Features::Relative),
+            Some(("appearance", n)) => n.parse().ok().map(|embedding| Features::Appearance { embedding }),
+            Some(("literal", n)) => n.parse().ok().map(|embedding| Features::Literal { embedding }),
+            _ => None,
         }
         .ok_or_else(|| UnknownFeatures(text.into()))
     }
@@ -112,7 +120,7 @@ impl Features {
     /// observations are valid. The picture is `(width, height)` pixels.
     pub fn push_history(self, track: &Tracklet, picture: (f64, f64), out: &mut Vec<f32>) -> usize {
         match self {
-            Features::Relative | Features::Appearance => relative::push_history(track, out),
+            Features::Relative | Features::Appearance { .. } => relative::push_history(track, out),
             Features::Literal { embedding } => literal::push_history(track, embedding, picture, out),
         }
         out.resize(out.len() + (super::HISTORY - track.history.len()) * self.step(), 0.0);
@@ -123,7 +131,7 @@ impl Features {
     pub fn push_candidate(self, pair: &PairView<'_>, picture: (f64, f64), out: &mut Vec<f32>) {
         match self {
             Features::Relative => out.extend(relative::candidate(pair)),
-            Features::Appearance => {
+            Features::Appearance { .. } => {
                 out.extend(relative::candidate(pair));
                 out.extend(appearance::likeness(pair));
             }
@@ -138,10 +146,12 @@ mod tests {
 
     #[test]
     fn names_are_read_as_they_are_written() {
-        for features in [Features::Relative, Features::Appearance, Features::Literal { embedding: 128 }] {
+        for features in
+            [Features::Relative, Features::Appearance { embedding: 9 }, Features::Literal { embedding: 128 }]
+        {
             assert_eq!(features.to_string().parse(), Ok(features));
         }
-        for wrong in ["", "Relative", "literal", "literal -1", "literal 128 ", "literal  128"] {
+        for wrong in ["", "Relative", "appearance", "literal", "literal -1", "literal 128 ", "literal  128"] {
             let error = wrong.parse::<Features>().expect_err(wrong);
             assert!(error.to_string().contains("appearance"), "{error}");
         }
