@@ -25,6 +25,8 @@ const REACH: isize = 5;
 const TEXTURE: f32 = 4.0;
 /// Blocks agree within this, pixels of the small picture.
 const AGREE: f32 = 0.4;
+/// Of three by three.
+const CENTRE: usize = 4;
 /// Steps of a level of luma.
 const UNIT: u32 = 4;
 /// Least number of blocks that agree.
@@ -129,23 +131,50 @@ impl Grey {
         costs.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, by)| by)
     }
 
-    /// The displacement near the best one, `by`, where the paraboloid through the costs around it has its
-    /// vertex; `by` itself where it has none.
-    fn refine<const SIDE: usize>(&self, at: (usize, usize), later: &Grey, by: [isize; 2]) -> [f32; 2] {
-        let cost = |dx: isize, dy: isize| self.cost::<SIDE>(at, later, [by[0] + dx, by[1] + dy]);
+    /// The displacement of the block of `SIDE` at `at` to a fraction of a pixel, at most two pixels from `guess`:
+    /// where the paraboloid through the costs around the best place has its vertex, the best place where it has
+    /// none. `None` where `guess` lies outside.
+    fn refine<const SIDE: usize>(
+        &self,
+        at: (usize, usize),
+        later: &Grey,
+        guess: [isize; 2],
+    ) -> Option<[f32; 2]> {
+        let around = |by: [isize; 2]| -> [Option<f32>; 9] {
+            std::array::from_fn(|i| {
+                let [dx, dy] = [i as isize % 3 - 1, i as isize / 3 - 1];
+                self.cost::<SIDE>(at, later, [by[0] + dx, by[1] + dy])
+            })
+        };
+        let mut by = guess;
+        let mut costs = around(by);
+        costs[CENTRE]?;
+        let cost = |i: usize| costs[i].unwrap_or(f32::INFINITY);
+        let best = (0..9).fold(CENTRE, |best, i| if cost(i) < cost(best) { i } else { best });
+        if best != CENTRE {
+            by = [by[0] + best as isize % 3 - 1, by[1] + best as isize / 3 - 1];
+            costs = around(by);
+        }
         let vertex = || {
-            let here = cost(0, 0)?;
-            let [left, right] = [cost(-1, 0)?, cost(1, 0)?];
-            let [above, below] = [cost(0, -1)?, cost(0, 1)?];
+            let [a, b, c, d, e, f, g, h, i] = costs;
+            let (left, here, right) = (d?, e?, f?);
+            let (above, below) = (b?, h?);
             let [gx, gy] = [(right - left) / 2.0, (below - above) / 2.0];
             let [xx, yy] = [right - 2.0 * here + left, below - 2.0 * here + above];
-            let xy = (cost(1, 1)? - cost(1, -1)? - cost(-1, 1)? + cost(-1, -1)?) / 4.0;
+            let xy = (i? - c? - g? + a?) / 4.0;
             let determinant = xx * yy - xy * xy;
             let step = [(xy * gy - yy * gx) / determinant, (xy * gx - xx * gy) / determinant];
             (xx > 0.0 && determinant > 0.0 && step.iter().all(|v| v.abs() <= 1.0)).then_some(step)
         };
         let step = vertex().unwrap_or_default();
-        [by[0] as f32 + step[0], by[1] as f32 + step[1]]
+        Some([by[0] as f32 + step[0], by[1] as f32 + step[1]])
+    }
+
+    /// Whether the block of `SIDE` at `at` fits `later` better where it is than a pixel beside it.
+    fn stays<const SIDE: usize>(&self, at: (usize, usize), later: &Grey) -> bool {
+        let cost = |dx, dy| self.cost::<SIDE>(at, later, [dx, dy]).unwrap_or(f32::INFINITY);
+        let here = cost(0, 0);
+        [(-1, 0), (1, 0), (0, -1), (0, 1)].iter().all(|(dx, dy)| here <= cost(*dx, *dy))
     }
 }
 
@@ -209,14 +238,18 @@ fn displacements(before: &[Grey; 3], now: &[Grey; 3]) -> Vec<[f32; 2]> {
         let mean = |axis: usize| inside.iter().map(|by| by[axis]).sum::<f32>() / inside.len() as f32;
         Some([0, 1].map(|axis| (2.0 * mean(axis)).round() as isize))
     };
-    let guess = search(2, BLOCK / 2, [0, 0], REACH).and_then(|guess| search(1, BLOCK, guess, 2));
+    let all = blocks(&before[1], BLOCK, BLOCK);
+    let staying = all.iter().filter(|at| before[1].stays::<BLOCK>(**at, &now[1])).count();
+    let guess = if 2 * staying > all.len() {
+        // A camera that stands still, or hardly moves: nothing has to be looked for.
+        Some([0, 0])
+    } else {
+        search(2, BLOCK / 2, [0, 0], REACH).and_then(|guess| search(1, BLOCK, guess, 2))
+    };
     let Some(guess) = guess else { return vec![] };
     const SIDE: usize = 2 * BLOCK;
-    let moves = blocks(&before[0], SIDE, SIDE).into_iter().filter_map(|at| {
-        let by = before[0].find::<SIDE>(at, &now[0], guess, 1)?;
-        Some(before[0].refine::<SIDE>(at, &now[0], by))
-    });
-    moves.collect()
+    let moves = blocks(&before[0], SIDE, SIDE).into_iter();
+    moves.filter_map(|at| before[0].refine::<SIDE>(at, &now[0], guess)).collect()
 }
 
 fn near(a: &[f32; 2], b: &[f32; 2], bound: f32) -> bool {
