@@ -16,7 +16,7 @@ pub struct Recipe {
     pub variants: Vec<Variant>,
     /// Examples wanted. Every copy of every sequence gives an equal part, so that a crowded one does
     /// not outvote the others; a short one may have fewer. Where not even half of them come together, the
-    /// copies are made again, up to [`ROUNDS`] times in all: other detections are lost in each.
+    /// copies are made again, up to `ROUNDS` times in all: other detections are lost in each.
     pub examples: usize,
     /// Share of them to validate on: those of the last part of every sequence.
     pub validation: f64,
