@@ -47,7 +47,9 @@ fn the_existence_head_travels_in_the_file() {
     let layer = Dense { weights: vec![0.25; EXISTENCE_FEATURES], bias: vec![-0.5] };
     let head = ExistenceHead::new([0.1; EXISTENCE_FEATURES], [3.0; EXISTENCE_FEATURES], vec![layer]);
     let head = head.expect("a network");
-    for (text, expected) in [(head.to_string(), Ok(head)), ("13 1 0 7".into(), Err("ends early"))] {
+    for (text, expected) in
+        [(head.to_string(), Ok(head)), (format!("{EXISTENCE_FEATURES} 1 0 7"), Err("ends early"))]
+    {
         let written = tempfile::tempdir().expect("a folder");
         let metadata = BTreeMap::from([("existence".to_owned(), text)]);
         let settings = write(written.path(), &folder, &model, &metadata);

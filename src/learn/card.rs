@@ -130,7 +130,7 @@ impl Card {
              wider; tracks lose their detections for up to 1.5 s now and then, so that gaps are seen; copies \
              are mirrored, thinned to a half and a third of the frames, with noise on the boxes and missing \
              detections.\n\n\
-             The file's metadata holds the existence head, a perceptron of 13, 12, 12 and 1 units that says \
+             The file's metadata holds the existence head, a perceptron of 15, 12, 12 and 1 units that says \
              which boxes of confirmed tracks are output (`src/track/existence.rs`). It was trained on the \
              {boxes} boxes that the tracker makes with this network on the same sequences, {:.1} % of them right.\n\n\
              ## Settings\n| | |\n| --- | --- |\n",

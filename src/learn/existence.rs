@@ -78,7 +78,7 @@ impl Boxes {
             if tracker.update(&links).is_err() {
                 continue;
             }
-            let scene = Scene::new(tracker.tracks(), (width, height));
+            let scene = Scene::new(tracker.tracks(), (width, height), tracker.record());
             let believed = tracker.tracks().iter().enumerate().filter(|(_, track)| track.confirmed);
             let (shown, values): (Vec<(BBox, bool)>, Vec<_>) =
                 believed.map(|(index, track)| ((track.bbox(), track.matched), scene.features(index))).unzip();

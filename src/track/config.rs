@@ -333,6 +333,6 @@ pub struct ExistenceConfig {
 
 impl Default for ExistenceConfig {
     fn default() -> Self {
-        Self { head: None, matched: -1.0, coasted: 0.0, coast: 0.5 }
+        Self { head: None, matched: -1.0, coasted: -0.3, coast: 0.5 }
     }
 }

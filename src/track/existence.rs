@@ -20,15 +20,18 @@
 //! | 10 | seconds for which it has been matched in every frame, at most 2 |
 //! | 11 | link probability of the last match |
 //! | 12 | `ln(1 + seconds since birth)` |
+//! | 13 | share of the believed tracks that the detector finds here |
+//! | 14 | share of the births that are confirmed here |
 
 use std::fmt;
 use std::str::FromStr;
 
+use super::record::DetectorRecord;
 use super::tracklet::Tracklet;
 use crate::types::BBox;
 
 /// Values that the network sees of a track.
-pub const EXISTENCE_FEATURES: usize = 13;
+pub const EXISTENCE_FEATURES: usize = 15;
 
 /// Normalised values are clipped at this many standard deviations.
 const CLIP: f32 = 4.0;
@@ -210,13 +213,14 @@ pub struct Scene<'a> {
     /// Tracks that may cover others: matched and believed.
     solid: Vec<usize>,
     size: (f64, f64),
+    record: DetectorRecord,
 }
 
 impl<'a> Scene<'a> {
-    /// `tracks` in a picture of `size` (width, height).
-    pub fn new(tracks: &'a [Tracklet], size: (f64, f64)) -> Self {
+    /// `tracks` in a picture of `size` (width, height), of a camera whose detector has this `record`.
+    pub fn new(tracks: &'a [Tracklet], size: (f64, f64), record: DetectorRecord) -> Self {
         let solid = (0..tracks.len()).filter(|&i| tracks[i].matched && tracks[i].confirmed).collect();
-        Self { tracks, boxes: tracks.iter().map(Tracklet::bbox).collect(), solid, size }
+        Self { tracks, boxes: tracks.iter().map(Tracklet::bbox).collect(), solid, size, record }
     }
 
     /// The values of a track, by its index.
@@ -250,6 +254,8 @@ impl<'a> Scene<'a> {
             streak.min(2.0),
             track.link,
             track.time.since(track.born).ln_1p(),
+            self.record.recall(),
+            self.record.precision(),
         ]
         .map(|v| v as f32)
     }
@@ -300,16 +306,16 @@ mod tests {
         let zeros = "0 ".repeat(2 * EXISTENCE_FEATURES + EXISTENCE_FEATURES + 1);
         for (text, expected) in [
             (String::new(), "ends early"),
-            ("13 x".into(), "value 1: no width"),
+            (format!("{EXISTENCE_FEATURES} x"), "value 1: no width"),
             (format!("12 1 0 {zeros}"), "other features"),
-            ("13 1 0 1 2 3".into(), "ends early"),
-            (format!("13 1 0 {zeros} 7"), "goes on"),
-            (format!("13 2 0 {zeros} {zeros}"), "goes on"),
-            (format!("13 1 0 b {zeros}"), "value 3: no number"),
+            (format!("{EXISTENCE_FEATURES} 1 0 1 2 3"), "ends early"),
+            (format!("{EXISTENCE_FEATURES} 1 0 {zeros} 7"), "goes on"),
+            (format!("{EXISTENCE_FEATURES} 2 0 {zeros} {zeros}"), "goes on"),
+            (format!("{EXISTENCE_FEATURES} 1 0 b {zeros}"), "value 3: no number"),
         ] {
             let error = text.parse::<ExistenceHead>().unwrap_err().to_string();
             assert!(error.contains(expected), "{text:?}: {error}");
         }
-        assert!(format!("13 1 0 {zeros}").parse::<ExistenceHead>().is_ok());
+        assert!(format!("{EXISTENCE_FEATURES} 1 0 {zeros}").parse::<ExistenceHead>().is_ok());
     }
 }

@@ -11,7 +11,8 @@
 //!
 //! One concept a file, in the order of a frame: [`motion`] and [`kalman`] predict, [`shift`]
 //! follows the camera, [`gate`] picks the pairs, [`features`] describes them, [`association`]
-//! and [`assign`] match them, [`tracklet`] lives and dies, [`existence`] says what is shown.
+//! and [`assign`] match them, [`tracklet`] lives and dies, [`record`] remembers how the detector does,
+//! [`existence`] says what is shown.
 
 pub mod assign;
 pub mod association;
@@ -24,6 +25,7 @@ mod link;
 pub mod motion;
 pub mod nearby;
 pub mod pair;
+pub mod record;
 pub mod shift;
 mod tracker;
 pub mod tracklet;

@@ -8,6 +8,7 @@ use super::link::{LinkRequest, Pair};
 use super::motion::Step;
 use super::nearby::Nearby;
 use super::pair::PairView;
+use super::record::DetectorRecord;
 use super::shift::{Shift, global_shift};
 use super::tracklet::Tracklet;
 use crate::types::{BBox, Detection, Embedding, MediaTime, TrackId, TrackReport};
@@ -85,6 +86,7 @@ pub struct Tracker {
     config: TrackerConfig,
     tracks: Vec<Tracklet>,
     next_id: u64,
+    record: DetectorRecord,
     // The frame in hand, between predict and update.
     awaiting: bool,
     size: (f64, f64),
@@ -104,6 +106,7 @@ impl Tracker {
             config,
             tracks: Vec::new(),
             next_id: 1,
+            record: DetectorRecord::default(),
             awaiting: false,
             size: (0.0, 0.0),
             time: MediaTime::default(),
@@ -118,6 +121,11 @@ impl Tracker {
     /// Live tracks, in the order of their ids.
     pub fn tracks(&self) -> &[Tracklet] {
         &self.tracks
+    }
+
+    /// How the detector does on this camera.
+    pub fn record(&self) -> DetectorRecord {
+        self.record
     }
 
     /// The usable detections of the frame in hand; pairs and decisions index into these.
@@ -146,6 +154,7 @@ impl Tracker {
         // Every track stands at the last frame's time.
         let time = self.time.max(frame.time);
         let step = Step::new(&self.config.filter, time.since(self.time));
+        self.record.fade(time.since(self.time));
         self.time = time;
         for track in &mut self.tracks {
             track.predict(time, &step);
@@ -207,7 +216,14 @@ impl Tracker {
         }
         for track in &mut self.tracks {
             track.count_frame();
-            track.confirmed |= track.hits >= self.config.life.confirm_hits;
+            if track.confirmed {
+                self.record.expect(track.missed_for(), track.matched);
+                continue;
+            }
+            track.confirmed = track.hits >= self.config.life.confirm_hits;
+            if track.confirmed || !track.matched {
+                self.record.settle(track.confirmed);
+            }
         }
         let (width, height) = self.size;
         let mut ended = Vec::new();
@@ -244,7 +260,7 @@ impl Tracker {
             return self.tracks.iter().map(|t| t.matched || t.missed_for() <= coast).collect();
         };
         let ExistenceConfig { matched, coasted, coast, .. } = self.config.existence;
-        let scene = existence::Scene::new(&self.tracks, self.size);
+        let scene = existence::Scene::new(&self.tracks, self.size, self.record);
         let shown = |(index, track): (usize, &Tracklet)| {
             let least = if track.matched { matched } else { coasted };
             let may = track.confirmed && (track.matched || track.missed_for() <= coast);
