@@ -15,6 +15,9 @@ use crate::learn::tune::{
 use crate::track::FilterConfig;
 use crate::tuning::{FilterTuning, Origin, Tuning};
 
+/// Filters that `--polish` tries on the simulated world.
+const POLISH_SIMULATED: u64 = 120;
+
 /// Tunes the noise of the Kalman filter by Bayesian optimisation of its consistency.
 ///
 /// ROOTs are MOTChallenge sequences (gt/gt.txt, det/det.txt, seqinfo.ini) or folders of them. Errors are
@@ -51,9 +54,10 @@ pub struct Args {
     /// Filters to try, for the noise of the centre and again for that of the size.
     #[arg(long, default_value_t = Settings::default().search.evaluations as u64, value_parser = clap::value_parser!(u64).range(10..=10_000))]
     pub evaluations: u64,
-    /// Filters to try after that, near the best one, by an evolution strategy (CMA-ES) that follows flat valleys.
-    #[arg(long, default_value_t = 0, value_name = "N", value_parser = clap::value_parser!(u64).range(0..=10_000))]
-    pub polish: u64,
+    /// Filters to try after that, near the best one, by an evolution strategy (CMA-ES) that follows flat valleys:
+    /// 120 with --simulated if not given, where the truth is the filter's own model, otherwise none.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(0..=10_000))]
+    pub polish: Option<u64>,
     /// What is made small: `likelihood` (negative log-likelihood of what the errors are held against) or
     /// `consistency` (|ln(mean / n)| as Chen et al. have it, over several horizons).
     #[arg(long, default_value = Cost::default().name(), value_parser = cost)]
@@ -85,7 +89,7 @@ impl Args {
             trim,
             search: Search {
                 evaluations: self.evaluations as usize,
-                polish: self.polish as usize,
+                polish: self.polish.unwrap_or(if self.simulated { POLISH_SIMULATED } else { 0 }) as usize,
                 seed: self.seed,
                 ..default.search
             },
