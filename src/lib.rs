@@ -5,7 +5,7 @@
 //!   ingest     types     detect        embed          infer        track     publish, api
 //! ```
 //!
-//! [`types`], [`track`] and [`mot`] are pure: they know no clock, thread, file or model, and
+//! [`types`], [`track`], [`analytics`] and [`mot`] are pure: they know no clock, thread, file or model, and
 //! `cargo test --no-default-features` builds and tests them alone.
 
 // F, Q, H, R, P, S and K are the field's names.
@@ -26,6 +26,8 @@ pub mod embed;
 pub mod infer;
 
 pub mod track;
+
+pub mod analytics;
 
 #[cfg(feature = "service")]
 pub mod config;
