@@ -339,11 +339,20 @@ mod tests {
             id = "loop"
             url = "clip.mp4"
             loop = true
+            [[camera.lines]]
+            id = "door"
+            points = [[0.5, 1], [0.5, 0]]
+            [[camera.zones]]
+            id = "floor"
+            points = [[0, 0], [1, 0], [1, 1]]
+            loiter_s = 30
             "#,
         )
         .unwrap();
         assert_eq!(config.cameras.len(), 2);
         assert_eq!(config.models.detector_size, Some((416, 352)));
+        let rules = config.cameras[1].rules().unwrap();
+        assert_eq!((rules.lines[0].points[0].y, rules.zones[0].loiter), (1.0, Some(30.0)));
         let tracker = config.tracker.apply(TrackerConfig::default()).unwrap();
         assert_eq!((tracker.life.lost, tracker.life.coast), (3.0, 2.5));
         assert_eq!(tracker.association.score, PairScore::LogLink);

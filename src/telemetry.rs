@@ -9,6 +9,7 @@ use prometheus::{
     Histogram, HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, IntGaugeVec, Opts, Registry,
 };
 
+use crate::analytics::{Direction, RuleId};
 use crate::infer::{BatchStats, Observer};
 use crate::types::{CameraId, TrackState};
 
@@ -96,6 +97,12 @@ pub struct Metrics {
     model_wait: HistogramVec,
     model_failures: IntCounterVec,
     provider: IntGaugeVec,
+    line_crossings: IntCounterVec,
+    zone_occupancy: IntGaugeVec,
+    zone_entries: IntCounterVec,
+    zone_exits: IntCounterVec,
+    zone_dwell: HistogramVec,
+    events: IntCounterVec,
 }
 
 /// One camera's handles, so that the per-frame path looks nothing up.
@@ -118,10 +125,24 @@ pub struct CameraMetrics {
     pub capture_latency: Histogram,
 }
 
+/// One zone's handles.
+pub struct ZoneMetrics {
+    /// Tracks in it now.
+    pub occupancy: IntGauge,
+    /// Tracks that came in.
+    pub entries: IntCounter,
+    /// Tracks that left or ended in it.
+    pub exits: IntCounter,
+    /// How long they were there.
+    pub dwell: Histogram,
+}
+
 const LATENCY_BUCKETS: [f64; 14] =
     [0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.2, 0.5, 1.0, 2.5, 10.0];
 const STAGE_BUCKETS: [f64; 14] =
     [0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 5.0];
+
+const DWELL_BUCKETS: [f64; 12] = [1.0, 2.5, 5.0, 10.0, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0];
 
 impl Metrics {
     /// Registers every metric, and the process's own, in a new registry.
@@ -208,6 +229,33 @@ impl Metrics {
                 "1 for the execution provider in use.",
                 &["provider"],
             )?,
+            line_crossings: counter(
+                "gakp_line_crossings_total",
+                "Tracks that crossed a line, by direction.",
+                &["camera", "line", "direction"],
+            )?,
+            zone_occupancy: gauge("gakp_zone_occupancy", "Tracks in a zone now.", &["camera", "zone"])?,
+            zone_entries: counter(
+                "gakp_zone_entries_total",
+                "Tracks that came into a zone.",
+                &["camera", "zone"],
+            )?,
+            zone_exits: counter(
+                "gakp_zone_exits_total",
+                "Tracks that left a zone or ended in it.",
+                &["camera", "zone"],
+            )?,
+            zone_dwell: histogram(
+                "gakp_zone_dwell_seconds",
+                "How long those who left a zone were in it.",
+                &["camera", "zone"],
+                &DWELL_BUCKETS,
+            )?,
+            events: counter(
+                "gakp_events_total",
+                "What happened at lines and in zones, by kind.",
+                &["camera", "kind"],
+            )?,
             registry,
         };
         Ok(Arc::new(metrics))
@@ -256,9 +304,57 @@ impl Metrics {
         for state in TrackState::ALL {
             let _ = self.tracks.remove_label_values(&[id, state.as_str()]);
         }
+        for kind in crate::publish::EVENT_KINDS {
+            let _ = self.events.remove_label_values(&[id, kind]);
+        }
         for kind in crate::ingest::Failure::LABELS {
             let _ = self.failures.remove_label_values(&[id, kind]);
         }
+    }
+
+    /// Lets a line's series appear, at zero.
+    pub fn line(&self, camera: &CameraId, line: &RuleId) {
+        for direction in [Direction::In, Direction::Out] {
+            self.crossings(camera, line, direction);
+        }
+    }
+
+    /// Crossings of a line in one direction.
+    pub fn crossings(&self, camera: &CameraId, line: &RuleId, direction: Direction) -> IntCounter {
+        self.line_crossings.with_label_values(&[camera.as_str(), line.as_str(), direction.as_str()])
+    }
+
+    /// Takes a removed line's series away.
+    pub fn forget_line(&self, camera: &CameraId, line: &RuleId) {
+        for direction in [Direction::In, Direction::Out] {
+            let labels = [camera.as_str(), line.as_str(), direction.as_str()];
+            let _ = self.line_crossings.remove_label_values(&labels);
+        }
+    }
+
+    /// The handles of a zone. Its series appear at once, at zero.
+    pub fn zone(&self, camera: &CameraId, zone: &RuleId) -> ZoneMetrics {
+        let labels = [camera.as_str(), zone.as_str()];
+        ZoneMetrics {
+            occupancy: self.zone_occupancy.with_label_values(&labels),
+            entries: self.zone_entries.with_label_values(&labels),
+            exits: self.zone_exits.with_label_values(&labels),
+            dwell: self.zone_dwell.with_label_values(&labels),
+        }
+    }
+
+    /// Takes a removed zone's series away.
+    pub fn forget_zone(&self, camera: &CameraId, zone: &RuleId) {
+        let labels = [camera.as_str(), zone.as_str()];
+        let _ = self.zone_occupancy.remove_label_values(&labels);
+        let _ = self.zone_entries.remove_label_values(&labels);
+        let _ = self.zone_exits.remove_label_values(&labels);
+        let _ = self.zone_dwell.remove_label_values(&labels);
+    }
+
+    /// Counts something that happened; `kind` is one of [`crate::publish::EVENT_KINDS`].
+    pub fn event(&self, camera: &CameraId, kind: &str) {
+        self.events.with_label_values(&[camera.as_str(), kind]).inc();
     }
 
     /// The time of one frame in one stage.

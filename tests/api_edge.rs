@@ -3,6 +3,8 @@
 
 #[path = "api/rest.rs"]
 mod rest;
+#[path = "api/rules.rs"]
+mod rules;
 #[path = "api/support.rs"]
 mod support;
 #[path = "api/tracks.rs"]

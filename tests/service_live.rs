@@ -3,6 +3,8 @@
 
 #[path = "service/account.rs"]
 mod account;
+#[path = "service/analytics.rs"]
+mod analytics;
 #[path = "browser/cdp.rs"]
 mod cdp;
 #[path = "service/ending.rs"]

@@ -9,7 +9,8 @@
 //! - A track counts once it is confirmed, from the place of its birth on; before that it does nothing, and one
 //!   that never is confirmed counts nowhere.
 //! - Only frames in which it was matched count: a predicted box crosses no line. Someone who was covered
-//!   while crossing is counted when found again on the other side.
+//!   while crossing is counted when found again on the other side, which takes [`FOUND_AGAIN`] matches: one match
+//!   after a gap may be a false alarm that a lost track has run into.
 //! - A place near a line or a zone's border decides nothing: within [`MARGIN`] heights of it a track stays on the
 //!   side where it was, so that a trembling box is no crowd.
 
@@ -33,6 +34,12 @@ use zone::ZoneWatch;
 
 /// Within this many heights of its box from a line or border, a track's side is undecided.
 pub const MARGIN: f64 = 0.05;
+
+/// A track that was not matched for longer than this, s, and in more than one frame, has to be found again.
+const GAP: f64 = 0.3;
+
+/// Matches that it takes to be found again.
+pub const FOUND_AGAIN: u32 = 3;
 
 /// Longest time between two frames that counts as presence, s; a longer one is a hole in the video.
 const LONGEST_STEP: f64 = 1.0;
@@ -134,6 +141,8 @@ pub struct Analyst {
     lines: Vec<LineWatch>,
     zones: Vec<ZoneWatch>,
     heat: Heat,
+    /// Matches of each track since it was last lost, and when the last of them was.
+    streaks: BTreeMap<TrackId, (u32, MediaTime)>,
 }
 
 impl Analyst {
@@ -179,22 +188,30 @@ impl Analyst {
             self.lines.iter_mut().for_each(|line| line.resize(size));
             self.zones.iter_mut().for_each(|zone| zone.resize(size));
         }
-        let step = self.time.map_or(0.0, |last| report.time.since(last).clamp(0.0, LONGEST_STEP));
+        let interval = self.time.map_or(0.0, |last| report.time.since(last).max(0.0));
+        let step = interval.min(LONGEST_STEP);
         self.time = Some(report.time);
         let seen: Vec<Seen> = { report.tracks.iter() }
             .filter(|track| track.matched)
             .map(|track| {
                 let bbox = &track.bbox;
+                let (matches, last) = self.streaks.entry(track.id).or_insert((0, report.time));
+                let lost = report.time.since(*last) > GAP.max(1.5 * interval);
+                *matches = if lost { 1 } else { *matches + 1 };
+                *last = report.time;
                 Seen {
                     id: track.id,
                     class: track.class,
                     foot: Point { x: bbox.cx(), y: bbox.bottom() },
                     centre: Point { x: bbox.cx(), y: bbox.cy() },
                     margin: MARGIN * bbox.h,
-                    counts: track.state == TrackState::Confirmed,
+                    counts: track.state == TrackState::Confirmed && *matches >= FOUND_AGAIN,
                 }
             })
             .collect();
+        for id in &report.ended {
+            self.streaks.remove(id);
+        }
         for track in seen.iter().filter(|track| track.counts) {
             self.heat.add(track.foot.within(size), step);
         }

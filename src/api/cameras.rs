@@ -8,6 +8,8 @@ use jiff::Timestamp;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use tokio::sync::watch;
 
+use super::rules::{EditError, Findings, LineSpec, RuleEdit, RulesSpec, ZoneSpec};
+use crate::analytics::{Heat, RuleError, Rules};
 use crate::publish::Picture;
 use crate::types::CameraId;
 
@@ -29,10 +31,22 @@ pub trait Cameras: Send + Sync + 'static {
     /// The camera's newest tracked frame with its tracks; `None` inside until the first one. `None`
     /// when there is no such camera. The sender goes when the camera is removed.
     fn video(&self, id: &CameraId) -> Option<watch::Receiver<Option<Arc<Picture>>>>;
+
+    /// The camera's lines and zones; `None` when there is no such camera.
+    fn rules(&self, id: &CameraId) -> Option<Rules>;
+
+    /// Changes the camera's lines and zones, and remembers them; gives all of them.
+    fn edit_rules(&self, id: &CameraId, edit: RuleEdit) -> BoxFuture<'_, Result<Rules, CameraError>>;
+
+    /// What the lines and zones have counted; `None` when there is no such camera.
+    fn findings(&self, id: &CameraId) -> Option<Findings>;
+
+    /// Where people were, and since when that is counted; `None` when there is no such camera.
+    fn heat(&self, id: &CameraId) -> Option<(Timestamp, Heat)>;
 }
 
 /// The body of `POST /v1/cameras`. Unknown fields are refused.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NewCamera {
     /// Its name, see [`CameraId`].
@@ -47,6 +61,22 @@ pub struct NewCamera {
     /// Whether a file begins again at its end.
     #[serde(rename = "loop", default)]
     pub looped: bool,
+    /// Lines to begin with; those that were changed later are remembered instead.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub lines: Vec<LineSpec>,
+    /// Zones to begin with, likewise.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub zones: Vec<ZoneSpec>,
+}
+
+impl NewCamera {
+    /// Its lines and zones.
+    ///
+    /// # Errors
+    /// One of them cannot be watched.
+    pub fn rules(&self) -> Result<Rules, RuleError> {
+        RulesSpec { lines: self.lines.clone(), zones: self.zones.clone() }.rules()
+    }
 }
 
 /// How RTSP carries media.
@@ -140,6 +170,9 @@ pub enum CameraError {
     /// The service has as many cameras as it is allowed.
     #[error("the limit of {0} cameras is reached; delete one first")]
     LimitReached(usize),
+    /// A change of its lines or zones is refused.
+    #[error(transparent)]
+    Rules(#[from] EditError),
     /// The list of cameras could not be written.
     #[error("{0}")]
     Io(String),

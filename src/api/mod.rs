@@ -7,18 +7,25 @@
 //! /v1/cameras/{id}/snapshot.jpg    newest picture, boxes drawn in
 //! /v1/cameras/{id}/stream.mjpeg    live pictures, boxes drawn in
 //! /v1/cameras/{id}/live            WebSocket: pictures as they are, each with its tracks
+//! /v1/cameras/{id}/lines[/{line}]  GET, POST, PUT, DELETE; zones likewise
+//! /v1/cameras/{id}/counts          crossings, occupancies
+//! /v1/cameras/{id}/heatmap         where people were
 //! /v1/tracks                       WebSocket: tracks as JSON or protobuf
+//! /v1/events[/live]                what happened at lines and in zones; a WebSocket of it
 //! /metrics /healthz /readyz
 //! ```
 //!
 //! It reads what the pipeline publishes through [`Cameras`] and [`Hub`] and never reaches into it.
 //! docs/api.md is the reference for users.
 
+mod analytics;
 mod cameras;
+mod events;
 mod live;
 mod page;
 mod problem;
 mod rest;
+mod rules;
 mod server;
 mod socket;
 mod tracks;
@@ -32,10 +39,11 @@ use axum::routing::get;
 use prometheus::Registry;
 
 pub use cameras::{CameraError, CameraState, CameraStatus, Cameras, NewCamera, TrackCounts, Transport};
+pub use rules::{AnchorSpec, EditError, Findings, LineSpec, Rule, RuleEdit, RulesSpec, ZoneSpec};
 pub use server::{serve, serve_with};
 pub use socket::KeepAlive;
 
-use crate::publish::Hub;
+use crate::publish::{EventHub, Hub};
 use socket::{Seats, Sockets};
 use video::Studio;
 
@@ -52,6 +60,8 @@ pub struct ApiConfig {
     pub cameras: Arc<dyn Cameras>,
     /// The tracks.
     pub hub: Hub,
+    /// What happens at lines and in zones.
+    pub events: EventHub,
     /// What `/metrics` shows.
     pub registry: Registry,
     /// What `/readyz` asks.
@@ -63,6 +73,7 @@ pub struct ApiConfig {
 struct ApiState {
     cameras: Arc<dyn Cameras>,
     hub: Hub,
+    events: EventHub,
     registry: Registry,
     readiness: Readiness,
     studio: Arc<Studio>,
@@ -71,16 +82,31 @@ struct ApiState {
 }
 
 fn router(config: ApiConfig, sockets: Sockets) -> Router {
-    let ApiConfig { cameras, hub, registry, readiness } = config;
+    let ApiConfig { cameras, hub, events, registry, readiness } = config;
     let studio = Arc::new(Studio::default());
-    let state = ApiState { cameras, hub, registry, readiness, studio, seats: Seats::default(), sockets };
+    let seats = Seats::default();
+    let state = ApiState { cameras, hub, events, registry, readiness, studio, seats, sockets };
     Router::new()
         .route("/v1/cameras", get(rest::list).post(rest::add))
         .route("/v1/cameras/{id}", get(rest::get).delete(rest::remove))
         .route("/v1/cameras/{id}/snapshot.jpg", get(live::snapshot))
         .route("/v1/cameras/{id}/stream.mjpeg", get(live::mjpeg))
         .route("/v1/cameras/{id}/live", get(live::live))
+        .route("/v1/cameras/{id}/lines", get(analytics::lines).post(analytics::add_line))
+        .route(
+            "/v1/cameras/{id}/lines/{line}",
+            get(analytics::line).put(analytics::put_line).delete(analytics::remove_line),
+        )
+        .route("/v1/cameras/{id}/zones", get(analytics::zones).post(analytics::add_zone))
+        .route(
+            "/v1/cameras/{id}/zones/{zone}",
+            get(analytics::zone).put(analytics::put_zone).delete(analytics::remove_zone),
+        )
+        .route("/v1/cameras/{id}/counts", get(analytics::counts))
+        .route("/v1/cameras/{id}/heatmap", get(analytics::heat_map))
         .route("/v1/tracks", get(tracks::tracks))
+        .route("/v1/events", get(events::recent))
+        .route("/v1/events/live", get(events::live))
         .route("/metrics", get(rest::metrics))
         .route("/healthz", get(rest::healthz))
         .route("/readyz", get(rest::readyz))

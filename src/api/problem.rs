@@ -5,7 +5,7 @@ use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 
-use super::CameraError;
+use super::{CameraError, EditError};
 use crate::types::CameraIdError;
 
 /// An error as the client sees it: `application/problem+json` with `type`, `title`, `status`, `detail`.
@@ -44,6 +44,10 @@ impl Problem {
             "No such camera",
             format!("there is no camera {name:?}; GET /v1/cameras lists them"),
         )
+    }
+
+    pub fn unknown_rule(detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::NOT_FOUND, "unknown-rule", "No such line or zone", detail)
     }
 
     pub fn method_not_allowed(detail: impl Into<String>) -> Self {
@@ -91,6 +95,19 @@ impl From<CameraIdError> for Problem {
     }
 }
 
+impl From<EditError> for Problem {
+    fn from(error: EditError) -> Self {
+        let detail = error.to_string();
+        match error {
+            EditError::Rule(_) => Self::bad_request(detail),
+            EditError::Exists(_) => {
+                Self::new(StatusCode::CONFLICT, "rule-exists", "Line or zone exists", detail)
+            }
+            EditError::Unknown { .. } => Self::unknown_rule(detail),
+        }
+    }
+}
+
 impl From<CameraError> for Problem {
     fn from(error: CameraError) -> Self {
         let detail = error.to_string();
@@ -103,6 +120,7 @@ impl From<CameraError> for Problem {
             CameraError::LimitReached(_) => {
                 Self::new(StatusCode::CONFLICT, "camera-limit", "Too many cameras", detail)
             }
+            CameraError::Rules(error) => error.into(),
             CameraError::Io(_) => Self::internal(detail),
         }
     }

@@ -65,7 +65,7 @@ pub(super) fn camera_id(name: &str) -> Result<CameraId, Problem> {
 
 /// The body as JSON. Insisting on its media type keeps other sites' forms out: a browser sends
 /// `application/json` to another origin only after asking, and we do not allow it.
-fn json_body<T: DeserializeOwned>(
+pub(super) fn json_body<T: DeserializeOwned>(
     headers: &HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Result<T, Problem> {

@@ -15,7 +15,7 @@ use crate::api::{self, ApiConfig, NewCamera};
 use crate::config::{Config, TrackerOptions};
 use crate::infer::Models;
 use crate::pipeline::{CameraSet, Lanes, MAX_CAMERAS, SetConfig, Store, source_spec};
-use crate::publish::{Hub, HubConfig};
+use crate::publish::{EventHub, Hub, HubConfig};
 use crate::telemetry::Metrics;
 use crate::track::TrackerConfig;
 use crate::types::CameraId;
@@ -101,6 +101,7 @@ impl Plan {
             source_spec(camera)
                 .and_then(|spec| spec.check())
                 .with_context(|| format!("camera {:?}", camera.id.as_str()))?;
+            camera.rules().with_context(|| format!("camera {:?}", camera.id.as_str()))?;
         }
         let limit = args.max_cameras.or(config.max_cameras).unwrap_or(64);
         if limit == 0 || limit > MAX_CAMERAS {
@@ -173,6 +174,7 @@ async fn start(plan: Plan) -> Result<Service> {
     models.check_suits(tracker.association.method)?;
     let hub = Hub::new(HubConfig::default(), models.detector.classes().into());
     hub.metrics().register(metrics.registry())?;
+    let events = EventHub::new(hub.classes().clone());
     let lanes = Lanes::start(models, metrics.clone())?;
     let listener = TcpListener::bind(plan.listen)
         .await
@@ -182,6 +184,7 @@ async fn start(plan: Plan) -> Result<Service> {
     let set = CameraSet::new(SetConfig {
         lanes,
         hub: hub.clone(),
+        events: events.clone(),
         metrics: metrics.clone(),
         tracker,
         store: Some(plan.store),
@@ -196,6 +199,7 @@ async fn start(plan: Plan) -> Result<Service> {
     let config = ApiConfig {
         cameras: set.clone(),
         hub,
+        events,
         registry: metrics.registry().clone(),
         // Models are warm before the port is bound: who can ask finds the service ready.
         readiness: Arc::new(Vec::new),
@@ -211,7 +215,7 @@ fn camera(text: &str, looped: bool) -> Result<NewCamera> {
         .filter(|(id, _)| !id.contains("://"))
         .context("--camera needs NAME=URL, such as gate=rtsp://10.0.0.2/stream1: the name is missing")?;
     let id = CameraId::new(id).context("--camera NAME=URL: wrong name")?;
-    Ok(NewCamera { id, url: url.into(), transport: None, looped })
+    Ok(NewCamera { id, url: url.into(), transport: None, looped, lines: vec![], zones: vec![] })
 }
 
 fn default_state_dir() -> Option<PathBuf> {

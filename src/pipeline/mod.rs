@@ -18,6 +18,7 @@
 //! It is built sink first, so each stage owns its downstream mailbox. A frame carries a [`Ticket`]
 //! from the decoder on, and the ticket is settled exactly once, whatever happens.
 
+mod analyst;
 mod camera;
 mod detect;
 mod embed;
@@ -29,6 +30,7 @@ mod store;
 mod ticket;
 mod tracker;
 
+pub use analyst::CameraAnalyst;
 pub use camera::{Camera, CameraPlan, CameraState, CameraView, Condition, Lanes, MAX_CAMERAS, StartError};
 pub use mailbox::{Mailbox, Policy};
 pub use outlet::{Collector, LiveOutlet, Outlet};

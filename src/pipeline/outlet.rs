@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use tokio::sync::{mpsc, watch};
 
+use super::analyst::CameraAnalyst;
 use crate::publish::{Hub, Picture};
 
 /// Takes tracked frames, on the tracker's thread.
@@ -18,12 +19,16 @@ pub struct LiveOutlet {
     pub hub: Hub,
     /// Watchers of the picture see the newest.
     pub video: watch::Sender<Option<Arc<Picture>>>,
+    /// Lines and zones.
+    pub analyst: Arc<CameraAnalyst>,
 }
 
 impl Outlet for LiveOutlet {
     fn emit(&mut self, picture: Picture) {
-        self.hub.publish(picture.tracks.clone());
+        let tracks = picture.tracks.clone();
+        self.hub.publish(tracks.clone());
         self.video.send_replace(Some(Arc::new(picture)));
+        self.analyst.take(&tracks);
     }
 }
 

@@ -9,13 +9,18 @@ use futures::future::BoxFuture;
 use jiff::Timestamp;
 use tokio::sync::watch;
 
+use super::analyst::CameraAnalyst;
 use super::camera::{Camera, CameraPlan, CameraState, CameraView, Lanes, MAX_CAMERAS, StartError};
 use super::mailbox::Policy;
 use super::outlet::LiveOutlet;
 use super::store::{Remembered, Store};
-use crate::api::{self, CameraError, CameraStatus, Cameras, NewCamera, TrackCounts};
+use crate::analytics::{Heat, Rules};
+use crate::api::{
+    self, CameraError, CameraStatus, Cameras, EditError, Findings, NewCamera, RuleEdit, RulesSpec,
+    TrackCounts,
+};
 use crate::ingest::{Pacing, SourceError, SourceSpec, Transport};
-use crate::publish::{Hub, Picture};
+use crate::publish::{EventHub, Hub, Picture};
 use crate::telemetry::{DropReason, Metrics};
 use crate::track::TrackerConfig;
 use crate::types::{CameraId, Epoch};
@@ -26,6 +31,8 @@ pub struct SetConfig {
     pub lanes: Lanes,
     /// Where tracks go.
     pub hub: Hub,
+    /// Where what happens at lines and in zones goes.
+    pub events: EventHub,
     /// What is measured.
     pub metrics: Arc<Metrics>,
     /// How to track.
@@ -40,6 +47,7 @@ pub struct SetConfig {
 pub struct CameraSet {
     lanes: Lanes,
     hub: Hub,
+    events: EventHub,
     metrics: Arc<Metrics>,
     tracker: TrackerConfig,
     limit: usize,
@@ -54,6 +62,7 @@ struct Shown {
     url: String,
     view: Arc<CameraView>,
     video: watch::Receiver<Option<Arc<Picture>>>,
+    analyst: Arc<CameraAnalyst>,
 }
 
 struct Changes {
@@ -66,12 +75,13 @@ struct Changes {
 impl CameraSet {
     /// An empty set. Cameras that are remembered start with [`CameraSet::start_remembered`].
     pub fn new(config: SetConfig) -> Arc<Self> {
-        let SetConfig { lanes, hub, metrics, tracker, store, limit } = config;
+        let SetConfig { lanes, hub, events, metrics, tracker, store, limit } = config;
         let (store, remembered) = store.map_or((None, Remembered::default()), |(s, r)| (Some(s), r));
         let changes = Changes { cameras: BTreeMap::new(), store, remembered, stopping: false };
         Arc::new(Self {
             lanes,
             hub,
+            events,
             metrics,
             tracker,
             limit: limit.min(MAX_CAMERAS),
@@ -116,6 +126,7 @@ impl CameraSet {
 
     async fn start(&self, camera: NewCamera, remember: bool) -> Result<CameraStatus, CameraError> {
         let spec = source_spec(&camera).map_err(|e| CameraError::Invalid(e.to_string()))?;
+        let first_rules = camera.rules().map_err(EditError::from)?;
         let mut changes = self.changes.lock().await;
         if changes.stopping {
             return Err(CameraError::Invalid("the service is stopping".into()));
@@ -140,6 +151,14 @@ impl CameraSet {
             changes.remembered = before;
             return Err(CameraError::Io(error.to_string()));
         }
+        // What was changed at run time wins; it was checked when it was remembered, but by an older program perhaps.
+        let changed = changes.remembered.rules.get(camera.id.as_str()).cloned();
+        let rules = changed.map_or(Ok(first_rules), RulesSpec::rules).unwrap_or_else(|error| {
+            tracing::error!(camera = %camera.id, %error, "its remembered lines and zones cannot be watched");
+            Rules::default()
+        });
+        let analyst = CameraAnalyst::new(camera.id.clone(), rules, self.metrics.clone(), self.events.clone());
+        let analyst = Arc::new(analyst);
         let (video, watched) = watch::channel(None);
         let url = spec.url.redacted().to_string();
         let plan = CameraPlan {
@@ -147,12 +166,13 @@ impl CameraSet {
             epoch,
             spec,
             tracker: self.tracker.clone(),
-            outlet: Box::new(LiveOutlet { hub: self.hub.clone(), video }),
+            outlet: Box::new(LiveOutlet { hub: self.hub.clone(), video, analyst: analyst.clone() }),
             policy: Policy::NewestWins,
         };
         let running = match Camera::start(&self.lanes, plan).await {
             Ok(running) => running,
             Err(error) => {
+                analyst.set_rules(Rules::default());
                 self.metrics.forget_camera(&camera.id);
                 if remember {
                     changes.remembered.cameras.retain(|c| c.id != camera.id);
@@ -164,7 +184,7 @@ impl CameraSet {
                 });
             }
         };
-        let shown = Shown { url, view: running.view().clone(), video: watched };
+        let shown = Shown { url, view: running.view().clone(), video: watched, analyst };
         let status = status(&shown);
         self.shown().insert(camera.id.clone(), shown);
         changes.cameras.insert(camera.id, running);
@@ -174,13 +194,39 @@ impl CameraSet {
     async fn stop(&self, id: &CameraId) -> Result<(), CameraError> {
         let mut changes = self.changes.lock().await;
         let Some(camera) = changes.cameras.remove(id) else { return Err(CameraError::NotFound) };
-        self.shown().remove(id);
+        let shown = self.shown().remove(id);
         let known = changes.remembered.cameras.len();
         changes.remembered.cameras.retain(|c| c.id != *id);
-        let saved = if changes.remembered.cameras.len() < known { self.save(&changes) } else { Ok(()) };
+        let had_rules = changes.remembered.rules.remove(id.as_str()).is_some();
+        let forgets = had_rules || changes.remembered.cameras.len() < known;
+        let saved = if forgets { self.save(&changes) } else { Ok(()) };
         camera.stop().await;
+        if let Some(shown) = shown {
+            shown.analyst.set_rules(Rules::default());
+        }
         self.metrics.forget_camera(id);
         saved
+    }
+
+    async fn edit(&self, id: &CameraId, edit: RuleEdit) -> Result<Rules, CameraError> {
+        // Held to the end: changes come one after the other, on disk as in the analyst.
+        let mut changes = self.changes.lock().await;
+        let Some(analyst) = self.analyst(id) else { return Err(CameraError::NotFound) };
+        let rules = edit.apply(&analyst.rules())?;
+        let before = changes.remembered.rules.insert(id.to_string(), RulesSpec::from(&rules));
+        if let Err(error) = self.save(&changes) {
+            match before {
+                Some(before) => changes.remembered.rules.insert(id.to_string(), before),
+                None => changes.remembered.rules.remove(id.as_str()),
+            };
+            return Err(error);
+        }
+        analyst.set_rules(rules.clone());
+        Ok(rules)
+    }
+
+    fn analyst(&self, id: &CameraId) -> Option<Arc<CameraAnalyst>> {
+        self.shown().get(id).map(|shown| shown.analyst.clone())
     }
 
     fn save(&self, changes: &Changes) -> Result<(), CameraError> {
@@ -215,6 +261,23 @@ impl Cameras for CameraSet {
 
     fn video(&self, id: &CameraId) -> Option<watch::Receiver<Option<Arc<Picture>>>> {
         self.shown().get(id).map(|shown| shown.video.clone())
+    }
+
+    fn rules(&self, id: &CameraId) -> Option<Rules> {
+        self.analyst(id).map(|analyst| analyst.rules())
+    }
+
+    fn edit_rules(&self, id: &CameraId, edit: RuleEdit) -> BoxFuture<'_, Result<Rules, CameraError>> {
+        let id = id.clone();
+        async move { self.edit(&id, edit).await }.boxed()
+    }
+
+    fn findings(&self, id: &CameraId) -> Option<Findings> {
+        self.analyst(id).map(|analyst| Findings { since: analyst.since(), counts: analyst.counts() })
+    }
+
+    fn heat(&self, id: &CameraId) -> Option<(Timestamp, Heat)> {
+        self.analyst(id).map(|analyst| (analyst.since(), analyst.heat()))
     }
 }
 

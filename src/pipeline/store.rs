@@ -1,5 +1,6 @@
 //! Cameras that were added at run time, remembered across restarts.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt;
@@ -7,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::api::NewCamera;
+use crate::api::{NewCamera, RulesSpec};
 
 /// A file `cameras.json` in the state folder. It holds camera passwords, so only its owner may read it.
 pub struct Store {
@@ -22,6 +23,9 @@ pub struct Remembered {
     pub epoch: u64,
     /// The cameras, in the order in which they were added.
     pub cameras: Vec<NewCamera>,
+    /// Lines and zones that were changed at run time, by camera; also of cameras that the configuration names.
+    #[serde(default)]
+    pub rules: BTreeMap<String, RulesSpec>,
 }
 
 /// The state folder cannot be used.
@@ -116,8 +120,11 @@ mod tests {
             url: "rtsp://u:p@h/s".into(),
             transport: None,
             looped: false,
+            lines: vec![],
+            zones: vec![],
         };
-        let saved = Remembered { epoch: 7, cameras: vec![camera] };
+        let rules = BTreeMap::from([("gate".into(), RulesSpec::default())]);
+        let saved = Remembered { epoch: 7, cameras: vec![camera], rules };
         store.save(&saved).unwrap();
         assert_eq!(Store::open(&folder).unwrap().1, saved);
         fs::write(folder.join("cameras.json"), "{").unwrap();

@@ -51,7 +51,7 @@ struct Hole {
 }
 
 /// RFC 3339 with nine decimals, in UTC.
-struct CaptureTs(i64);
+pub(super) struct CaptureTs(pub(super) i64);
 
 impl Serialize for CaptureTs {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
@@ -62,7 +62,7 @@ impl Serialize for CaptureTs {
 }
 
 /// `value` rounded to a multiple of `1 / per_unit`; what is no number becomes 0, never `null`.
-fn round(value: f64, per_unit: f64) -> f64 {
+pub(super) fn round(value: f64, per_unit: f64) -> f64 {
     let rounded = (value * per_unit).round() / per_unit;
     // Adding zero turns -0 into 0.
     if rounded.is_finite() { rounded + 0.0 } else { 0.0 }
@@ -115,7 +115,7 @@ pub(super) fn gap(gap: &Gap) -> Bytes {
     })
 }
 
-fn encode(message: &impl Serialize) -> Bytes {
+pub(super) fn encode(message: &impl Serialize) -> Bytes {
     // Serialising fails for maps with keys that are no strings and for failing Serialize
     // implementations; these structs have neither.
     serde_json::to_vec(message).expect("wire structs always serialise").into()

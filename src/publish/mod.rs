@@ -3,9 +3,10 @@
 //! The tracker's thread calls [`Hub::publish`], which waits for nobody. Each subscriber has a bounded
 //! ring of its own; what it is too slow to take is dropped, oldest first, and announced as a [`Gap`].
 //! A [`Report`] is encoded at most once per format, by the first subscriber that sends it, and the
-//! bytes are shared.
+//! bytes are shared. What the analytics find in the tracks goes to an [`EventHub`].
 
 mod draw;
+mod event;
 mod hub;
 mod json;
 mod picture;
@@ -13,6 +14,7 @@ mod protobuf;
 mod report;
 
 pub use draw::{Trails, annotate, colour};
+pub use event::{EVENT_KINDS, EventFilter, EventHub, EventListener, Heard, NumberedEvent, event_kind};
 pub use hub::{Event, Gap, Hub, HubConfig, HubMetrics, Only, Subscription};
 pub use picture::{Picture, PictureError, Rgb, RgbConverter};
 pub use protobuf::wire;

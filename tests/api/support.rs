@@ -9,10 +9,12 @@ use std::time::{Duration, Instant};
 
 use futures::future::BoxFuture;
 use futures::{FutureExt, StreamExt};
+use gakp::analytics::{Analyst, Heat, Rules};
 use gakp::api::{
-    ApiConfig, CameraError, CameraState, CameraStatus, Cameras, KeepAlive, NewCamera, TrackCounts,
+    ApiConfig, CameraError, CameraState, CameraStatus, Cameras, Findings, KeepAlive, NewCamera, RuleEdit,
+    TrackCounts,
 };
-use gakp::publish::{Hub, HubConfig, Picture};
+use gakp::publish::{EventHub, Hub, HubConfig, Picture};
 use gakp::types::{
     BBox, CameraId, CaptureTime, ClassId, Clock, Epoch, Frame, FrameTracks, Image, MediaTime, Plane, TrackId,
     TrackReport, TrackState, YuvMatrix, YuvRange,
@@ -58,6 +60,7 @@ type Video = watch::Sender<Option<Arc<Picture>>>;
 #[derive(Default)]
 pub struct FakeCameras {
     cameras: Mutex<BTreeMap<CameraId, (CameraStatus, Video)>>,
+    analysts: Mutex<BTreeMap<CameraId, Analyst>>,
 }
 
 impl FakeCameras {
@@ -94,6 +97,12 @@ impl FakeCameras {
         let Some((_, video)) = cameras.get(&picture.tracks.camera) else { return false };
         video.send_replace(Some(Arc::new(picture)));
         true
+    }
+
+    /// What watches the camera's lines and zones; `None` when there is no such camera.
+    pub fn analyst<T>(&self, id: &CameraId, ask: impl FnOnce(&mut Analyst) -> T) -> Option<T> {
+        self.get(id)?;
+        Some(ask(self.analysts.lock().unwrap().entry(id.clone()).or_default()))
     }
 
     /// How many watch the camera's pictures at the source.
@@ -135,12 +144,36 @@ impl Cameras for FakeCameras {
     fn video(&self, id: &CameraId) -> Option<watch::Receiver<Option<Arc<Picture>>>> {
         self.cameras.lock().unwrap().get(id).map(|(_, video)| video.subscribe())
     }
+
+    fn rules(&self, id: &CameraId) -> Option<Rules> {
+        self.analyst(id, |analyst| analyst.rules().clone())
+    }
+
+    fn edit_rules(&self, id: &CameraId, edit: RuleEdit) -> BoxFuture<'_, Result<Rules, CameraError>> {
+        let edited = self.analyst(id, |analyst| {
+            let rules = edit.apply(analyst.rules())?;
+            analyst.set_rules(rules.clone());
+            Ok(rules)
+        });
+        async move { edited.unwrap_or(Err(CameraError::NotFound)) }.boxed()
+    }
+
+    fn findings(&self, id: &CameraId) -> Option<Findings> {
+        let since = "2026-01-02T03:04:05.678Z".parse().unwrap();
+        self.analyst(id, |analyst| Findings { since, counts: analyst.counts() })
+    }
+
+    fn heat(&self, id: &CameraId) -> Option<(jiff::Timestamp, Heat)> {
+        let since = "2026-01-02T03:04:05.678Z".parse().unwrap();
+        self.analyst(id, |analyst| (since, analyst.heat().clone()))
+    }
 }
 
 /// A running server.
 pub struct Server {
     pub addr: SocketAddr,
     pub hub: Hub,
+    pub events: EventHub,
     pub cameras: Arc<FakeCameras>,
     pub ready: Arc<AtomicBool>,
     stop: oneshot::Sender<()>,
@@ -165,6 +198,7 @@ impl Server {
         let listener = TcpListener::bind(addr).await.unwrap();
         let addr = listener.local_addr().unwrap();
         let hub = Hub::new(hub, ["person".to_owned(), "car".to_owned()].into());
+        let events = EventHub::new(hub.classes().clone());
         let registry = Registry::new();
         hub.metrics().register(&registry).unwrap();
         let ready = Arc::new(AtomicBool::new(true));
@@ -172,6 +206,7 @@ impl Server {
         let config = ApiConfig {
             cameras: cameras.clone(),
             hub: hub.clone(),
+            events: events.clone(),
             registry,
             readiness: Arc::new(move || match answer.load(Ordering::SeqCst) {
                 true => vec![],
@@ -182,7 +217,7 @@ impl Server {
         let done = tokio::spawn(gakp::api::serve_with(listener, config, keep_alive, async {
             let _ = stopped.await;
         }));
-        Self { addr, hub, cameras, ready, stop, done }
+        Self { addr, hub, events, cameras, ready, stop, done }
     }
 
     /// Stops it and says how long that took.

@@ -1,0 +1,105 @@
+//! `/v1/events`: what happened lately; `/v1/events/live`: a WebSocket of what happens.
+
+use axum::body::Bytes;
+use axum::extract::ws::rejection::WebSocketUpgradeRejection;
+use axum::extract::ws::{Message, Utf8Bytes, WebSocketUpgrade, close_code};
+use axum::extract::{Query, State};
+use axum::http::{HeaderMap, header};
+use axum::response::{IntoResponse, Response};
+
+use super::ApiState;
+use super::problem::Problem;
+use super::socket::{self, Outgoing};
+use crate::publish::{EVENT_KINDS, EventFilter, EventListener, Heard};
+use crate::types::CameraId;
+
+/// Events in an answer if the client does not say.
+const DEFAULT_LIMIT: usize = 100;
+/// Events in an answer at most: as many as are kept.
+const MAX_LIMIT: usize = 1000;
+
+/// `GET /v1/events?camera=&type=&limit=`: the newest first.
+pub(super) async fn recent(
+    State(state): State<ApiState>,
+    Query(query): Query<Vec<(String, String)>>,
+) -> Result<Response, Problem> {
+    let mut limit = DEFAULT_LIMIT;
+    let mut rest = vec![];
+    for (key, value) in query {
+        if key == "limit" {
+            limit = value.parse().ok().filter(|n| (1..=MAX_LIMIT).contains(n)).ok_or_else(|| {
+                Problem::bad_request(format!("limit={value:?} must be a number from 1 to {MAX_LIMIT}"))
+            })?;
+        } else {
+            rest.push((key, value));
+        }
+    }
+    let filter = filter(&state, &rest, "`camera`, `type` and `limit`")?;
+    let events = state.events.recent(&filter, limit);
+    let mut body = b"{\"events\":[".to_vec();
+    for (index, event) in events.iter().enumerate() {
+        if index > 0 {
+            body.push(b',');
+        }
+        body.extend_from_slice(&event.json);
+    }
+    body.extend_from_slice(b"]}");
+    Ok(([(header::CONTENT_TYPE, "application/json")], body).into_response())
+}
+
+/// `GET /v1/events/live?camera=&type=`: a WebSocket.
+pub(super) async fn live(
+    State(state): State<ApiState>,
+    Query(query): Query<Vec<(String, String)>>,
+    headers: HeaderMap,
+    upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
+) -> Result<Response, Problem> {
+    let upgrade = socket::upgrade(&headers, upgrade)?;
+    let filter = filter(&state, &query, "`camera` and `type`")?;
+    let seat = state.seats.take()?;
+    let sockets = state.sockets.clone();
+    let stream = EventStream(state.events.listen(filter));
+    Ok(upgrade.on_upgrade(|socket| async move {
+        let _seat = seat;
+        socket::run(socket, sockets, stream).await;
+    }))
+}
+
+fn filter(state: &ApiState, query: &[(String, String)], known: &str) -> Result<EventFilter, Problem> {
+    let mut filter = EventFilter::default();
+    for (key, value) in query {
+        match key.as_str() {
+            "camera" => {
+                let id = CameraId::new(value)?;
+                if state.cameras.get(&id).is_none() {
+                    return Err(Problem::unknown_camera(value));
+                }
+                filter.cameras.insert(id);
+            }
+            "type" => {
+                let kind = EVENT_KINDS.into_iter().find(|kind| kind == value).ok_or_else(|| {
+                    Problem::bad_request(format!("type={value:?} is none of {}", EVENT_KINDS.join(", ")))
+                })?;
+                filter.kinds.insert(kind);
+            }
+            _ => return Err(Problem::bad_request(format!("unknown parameter {key:?}; there are {known}"))),
+        }
+    }
+    Ok(filter)
+}
+
+struct EventStream(EventListener);
+
+impl Outgoing for EventStream {
+    async fn next(&mut self) -> Option<Message> {
+        let json = match self.0.next().await? {
+            Heard::Event(event) => event.json.clone(),
+            Heard::Missed(missed) => Bytes::from(format!("{{\"gap\":{{\"missed\":{missed}}}}}")),
+        };
+        Utf8Bytes::try_from(json).ok().map(Message::Text)
+    }
+
+    fn farewell(&self) -> (u16, &'static str) {
+        (close_code::AWAY, "the service stops")
+    }
+}

@@ -1,0 +1,257 @@
+//! Lines and zones on the wire, and how they are changed.
+
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+
+use crate::analytics::{Anchor, Counts, Line, Point, RuleError, RuleId, Rules, Zone};
+
+/// A line as it is sent. Unknown fields are refused.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LineSpec {
+    /// Its name, unique among the camera's lines.
+    pub id: String,
+    /// 2 to 32 points `[x, y]` in fractions of the picture, from the top left.
+    pub points: Vec<[f64; 2]>,
+    /// What of a box crosses it.
+    #[serde(default)]
+    pub anchor: AnchorSpec,
+}
+
+/// A zone as it is sent. Unknown fields are refused.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ZoneSpec {
+    /// Its name, unique among the camera's zones.
+    pub id: String,
+    /// 3 to 32 corners `[x, y]` in fractions of the picture, from the top left.
+    pub points: Vec<[f64; 2]>,
+    /// What of a box is in it.
+    #[serde(default)]
+    pub anchor: AnchorSpec,
+    /// Who stays longer loiters, seconds.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub loiter_s: Option<f64>,
+    /// More than so many are a crowd.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub capacity: Option<u32>,
+}
+
+/// What of a box is held against lines and zones.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum AnchorSpec {
+    /// The middle of its lower edge.
+    #[default]
+    Foot,
+    /// Its centre.
+    Centre,
+}
+
+/// All lines and zones of a camera.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RulesSpec {
+    /// Lines.
+    #[serde(default)]
+    pub lines: Vec<LineSpec>,
+    /// Zones.
+    #[serde(default)]
+    pub zones: Vec<ZoneSpec>,
+}
+
+/// A change of a camera's rules.
+#[derive(Clone, Debug)]
+pub enum RuleEdit {
+    /// A new one; its name must be free.
+    Add(Rule),
+    /// A new one, or another in the place of the one of its name.
+    Put(Rule),
+    /// The line of that name goes.
+    RemoveLine(RuleId),
+    /// The zone of that name goes.
+    RemoveZone(RuleId),
+}
+
+/// One of a camera's rules.
+#[derive(Clone, Debug)]
+pub enum Rule {
+    /// A line.
+    Line(Line),
+    /// A zone.
+    Zone(Zone),
+}
+
+/// Why a change of the rules is refused.
+#[derive(Debug, thiserror::Error)]
+pub enum EditError {
+    /// It cannot be watched.
+    #[error(transparent)]
+    Rule(#[from] RuleError),
+    /// The name is taken.
+    #[error("{0} exists; PUT replaces it")]
+    Exists(RuleId),
+    /// There is none of that name.
+    #[error("there is no {what} {id:?} on this camera", id = id.as_str())]
+    Unknown {
+        /// `line` or `zone`.
+        what: &'static str,
+        /// The name.
+        id: RuleId,
+    },
+}
+
+impl RuleEdit {
+    /// `rules` with the change.
+    ///
+    /// # Errors
+    /// [`EditError`]; `rules` are as they were then.
+    pub fn apply(self, rules: &Rules) -> Result<Rules, EditError> {
+        let mut rules = rules.clone();
+        match self {
+            RuleEdit::Add(Rule::Line(line)) => add(&mut rules.lines, line)?,
+            RuleEdit::Add(Rule::Zone(zone)) => add(&mut rules.zones, zone)?,
+            RuleEdit::Put(Rule::Line(line)) => put(&mut rules.lines, line),
+            RuleEdit::Put(Rule::Zone(zone)) => put(&mut rules.zones, zone),
+            RuleEdit::RemoveLine(id) => remove(&mut rules.lines, id)?,
+            RuleEdit::RemoveZone(id) => remove(&mut rules.zones, id)?,
+        }
+        rules.check()?;
+        Ok(rules)
+    }
+}
+
+trait Named {
+    const WHAT: &'static str;
+    fn id(&self) -> &RuleId;
+}
+
+impl Named for Line {
+    const WHAT: &'static str = "line";
+    fn id(&self) -> &RuleId {
+        &self.id
+    }
+}
+
+impl Named for Zone {
+    const WHAT: &'static str = "zone";
+    fn id(&self) -> &RuleId {
+        &self.id
+    }
+}
+
+fn add<T: Named>(all: &mut Vec<T>, new: T) -> Result<(), EditError> {
+    if all.iter().any(|old| old.id() == new.id()) {
+        return Err(EditError::Exists(new.id().clone()));
+    }
+    all.push(new);
+    Ok(())
+}
+
+fn put<T: Named>(all: &mut Vec<T>, new: T) {
+    match all.iter_mut().find(|old| old.id() == new.id()) {
+        Some(old) => *old = new,
+        None => all.push(new),
+    }
+}
+
+fn remove<T: Named>(all: &mut Vec<T>, id: RuleId) -> Result<(), EditError> {
+    let before = all.len();
+    all.retain(|rule| *rule.id() != id);
+    if all.len() < before { Ok(()) } else { Err(EditError::Unknown { what: T::WHAT, id }) }
+}
+
+impl From<AnchorSpec> for Anchor {
+    fn from(anchor: AnchorSpec) -> Self {
+        match anchor {
+            AnchorSpec::Foot => Anchor::Foot,
+            AnchorSpec::Centre => Anchor::Centre,
+        }
+    }
+}
+
+impl From<Anchor> for AnchorSpec {
+    fn from(anchor: Anchor) -> Self {
+        match anchor {
+            Anchor::Foot => AnchorSpec::Foot,
+            Anchor::Centre => AnchorSpec::Centre,
+        }
+    }
+}
+
+fn points(points: Vec<[f64; 2]>) -> Vec<Point> {
+    points.into_iter().map(|[x, y]| Point { x, y }).collect()
+}
+
+fn pairs(points: &[Point]) -> Vec<[f64; 2]> {
+    points.iter().map(|p| [p.x, p.y]).collect()
+}
+
+impl TryFrom<LineSpec> for Line {
+    type Error = RuleError;
+
+    fn try_from(spec: LineSpec) -> Result<Self, RuleError> {
+        Ok(Self { id: RuleId::new(&spec.id)?, points: points(spec.points), anchor: spec.anchor.into() })
+    }
+}
+
+impl TryFrom<ZoneSpec> for Zone {
+    type Error = RuleError;
+
+    fn try_from(spec: ZoneSpec) -> Result<Self, RuleError> {
+        let ZoneSpec { id, points: corners, anchor, loiter_s, capacity } = spec;
+        let id = RuleId::new(&id)?;
+        Ok(Self { id, points: points(corners), anchor: anchor.into(), loiter: loiter_s, capacity })
+    }
+}
+
+impl From<&Line> for LineSpec {
+    fn from(line: &Line) -> Self {
+        Self { id: line.id.to_string(), points: pairs(&line.points), anchor: line.anchor.into() }
+    }
+}
+
+impl From<&Zone> for ZoneSpec {
+    fn from(zone: &Zone) -> Self {
+        Self {
+            id: zone.id.to_string(),
+            points: pairs(&zone.points),
+            anchor: zone.anchor.into(),
+            loiter_s: zone.loiter,
+            capacity: zone.capacity,
+        }
+    }
+}
+
+impl RulesSpec {
+    /// What is to be watched.
+    ///
+    /// # Errors
+    /// [`RuleError`], of the first that cannot be.
+    pub fn rules(self) -> Result<Rules, RuleError> {
+        let rules = Rules {
+            lines: self.lines.into_iter().map(Line::try_from).collect::<Result<_, _>>()?,
+            zones: self.zones.into_iter().map(Zone::try_from).collect::<Result<_, _>>()?,
+        };
+        rules.check()?;
+        Ok(rules)
+    }
+}
+
+impl From<&Rules> for RulesSpec {
+    fn from(rules: &Rules) -> Self {
+        Self {
+            lines: rules.lines.iter().map(LineSpec::from).collect(),
+            zones: rules.zones.iter().map(ZoneSpec::from).collect(),
+        }
+    }
+}
+
+/// What a camera's analytics have found.
+#[derive(Clone, Debug)]
+pub struct Findings {
+    /// Since when.
+    pub since: Timestamp,
+    /// Crossings, occupancies.
+    pub counts: Counts,
+}
