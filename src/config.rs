@@ -22,6 +22,12 @@ pub struct Config {
     pub listen: Option<SocketAddr>,
     /// Where cameras that were added at run time are remembered.
     pub state_dir: Option<PathBuf>,
+    /// Certificate chain, PEM; relative to the working folder.
+    pub tls_cert: Option<PathBuf>,
+    /// Its private key, PEM.
+    pub tls_key: Option<PathBuf>,
+    /// File with an admin's token.
+    pub admin_token_file: Option<PathBuf>,
     /// Most cameras at a time.
     pub max_cameras: Option<usize>,
     /// Models and where they run.

@@ -41,6 +41,8 @@ pub mod tuning;
 #[cfg(feature = "service")]
 pub mod api;
 #[cfg(feature = "service")]
+pub mod auth;
+#[cfg(feature = "service")]
 pub mod publish;
 
 pub mod mot;

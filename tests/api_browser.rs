@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use cdp::{Browser, Page};
 use gakp::api::KeepAlive;
+use gakp::auth::{Gate, Role, TokenFile};
 use gakp::publish::{HubConfig, colour};
 use gakp::types::{BBox, TrackId};
 use serde_json::json;
@@ -169,6 +170,65 @@ async fn the_page_comes_back_with_the_service() {
     let server = Server::start_on(addr, cameras, HubConfig::default(), KeepAlive::default()).await;
     let later = format!("{gate}.dataset.seq > {} && document.querySelector('#offline').hidden", before + 5);
     browser.wait_for(&page, "pictures again", &later).await;
+    filming.abort();
+    server.stop().await;
+}
+
+/// Without a token nothing is shown; with a viewer's what a viewer may see, and nothing to change.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_page_asks_for_a_token() {
+    let Some(mut browser) = Browser::start().await else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let file = TokenFile::path(folder.path());
+    let mut tokens = TokenFile::default();
+    let [wall, desk] = [("wall", true), ("desk", false)]
+        .map(|(name, video)| tokens.create(name, Role::Viewer, video).unwrap().reveal().to_owned());
+    tokens.write(&file).unwrap();
+    let server = Server::start_behind(Gate::new(file.clone(), true).unwrap(), None).await;
+    server.cameras.put("gate", "rtsp://host/gate");
+    let filming = film(server.cameras.clone(), "gate");
+    let page = browser.open(&format!("http://{}/", server.addr)).await;
+    browser.wait_for(&page, "the form", "!document.querySelector('#login').hidden").await;
+    assert_eq!(browser.eval(&page, "document.querySelector('#main').hidden").await, json!(true));
+    let sign_in = |token: &str| {
+        format!(
+            "(() => {{ const f = document.querySelector('#login'); f.elements.token.value = {}; f.requestSubmit();
+             return true; }})()",
+            json!(token)
+        )
+    };
+    browser.eval(&page, &sign_in("gakp_wrong")).await;
+    let refused =
+        browser.wait_for(&page, "the refusal", "document.querySelector('#login-result').textContent").await;
+    assert!(refused.as_str().unwrap().contains("not known"), "{refused}");
+
+    browser.eval(&page, &sign_in(&desk)).await;
+    let gate = card("gate");
+    let note = format!("{gate}?.querySelector('.note').textContent");
+    let note = browser.wait_for(&page, "the camera's note", &note).await;
+    assert_eq!(note, json!("Your token may not see pictures."));
+    browser.eval(&page, "document.querySelector('#sign-out').click() ?? true").await;
+    browser.wait_for(&page, "the form again", "!document.querySelector('#login').hidden").await;
+
+    browser.eval(&page, &sign_in(&wall)).await;
+    browser.wait_for(&page, "a picture", &format!("{gate}?.dataset.pictures > 0")).await;
+    assert_eq!(
+        browser.eval(&page, "document.querySelector('#who span').textContent").await,
+        json!("wall (viewer)")
+    );
+    for hidden in [
+        "document.querySelector('.add').hidden".to_owned(),
+        format!("{gate}.querySelector('.delete').hidden"),
+    ] {
+        assert_eq!(browser.eval(&page, &hidden).await, json!(true), "{hidden}");
+    }
+    // The cookie is out of the reach of scripts.
+    assert_eq!(browser.eval(&page, "document.cookie").await, json!(""));
+    tokens.revoke("wall").unwrap();
+    tokens.write(&file).unwrap();
+    browser
+        .wait_for(&page, "the form after the token's end", "!document.querySelector('#login').hidden")
+        .await;
     filming.abort();
     server.stop().await;
 }

@@ -1,6 +1,8 @@
 //! The HTTP and WebSocket edge, against a real server in this process with cameras that are made up.
 #![cfg(feature = "service")]
 
+#[path = "api/auth.rs"]
+mod auth;
 #[path = "api/rest.rs"]
 mod rest;
 #[path = "api/rules.rs"]

@@ -5,5 +5,7 @@
 mod mistakes;
 #[path = "service/support.rs"]
 mod support;
+#[path = "service/tokens.rs"]
+mod tokens;
 #[path = "service/track.rs"]
 mod track;

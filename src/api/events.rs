@@ -1,5 +1,6 @@
 //! `/v1/events`: what happened lately; `/v1/events/live`: a WebSocket of what happens.
 
+use axum::Extension;
 use axum::body::Bytes;
 use axum::extract::ws::rejection::WebSocketUpgradeRejection;
 use axum::extract::ws::{Message, Utf8Bytes, WebSocketUpgrade, close_code};
@@ -9,7 +10,8 @@ use axum::response::{IntoResponse, Response};
 
 use super::ApiState;
 use super::problem::Problem;
-use super::socket::{self, Outgoing};
+use super::socket::{self, Outgoing, Pass};
+use crate::auth::Identity;
 use crate::publish::{EVENT_KINDS, EventFilter, EventListener, Heard};
 use crate::types::CameraId;
 
@@ -51,17 +53,18 @@ pub(super) async fn recent(
 pub(super) async fn live(
     State(state): State<ApiState>,
     Query(query): Query<Vec<(String, String)>>,
+    Extension(identity): Extension<Option<Identity>>,
     headers: HeaderMap,
     upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
 ) -> Result<Response, Problem> {
     let upgrade = socket::upgrade(&headers, upgrade)?;
     let filter = filter(&state, &query, "`camera` and `type`")?;
     let seat = state.seats.take()?;
-    let sockets = state.sockets.clone();
+    let (sockets, pass) = (state.sockets.clone(), Pass::new(&state.gate, identity));
     let stream = EventStream(state.events.listen(filter));
     Ok(upgrade.on_upgrade(|socket| async move {
         let _seat = seat;
-        socket::run(socket, sockets, stream).await;
+        socket::run(socket, sockets, pass, stream).await;
     }))
 }
 

@@ -3,6 +3,7 @@
 use std::convert::Infallible;
 use std::sync::Arc;
 
+use axum::Extension;
 use axum::body::{Body, Bytes};
 use axum::extract::ws::rejection::WebSocketUpgradeRejection;
 use axum::extract::ws::{Message, WebSocketUpgrade, close_code};
@@ -17,8 +18,9 @@ use super::ApiState;
 use super::problem::Problem;
 use super::rest::camera_id;
 use super::server::Stop;
-use super::socket::{self, Outgoing, SEND_TIMEOUT};
+use super::socket::{self, Outgoing, Pass, SEND_TIMEOUT};
 use super::video::{Shot, View};
+use crate::auth::Identity;
 use crate::publish::encode_json;
 
 /// `GET /v1/cameras/{id}/snapshot.jpg`: the newest tracked picture; `?annotate=false` without boxes.
@@ -62,6 +64,7 @@ pub(super) async fn mjpeg(
     State(state): State<ApiState>,
     Path(name): Path<String>,
     Query(query): Query<Vec<(String, String)>>,
+    Extension(identity): Extension<Option<Identity>>,
 ) -> Result<Response, Problem> {
     let view = view(&query)?;
     let shots = state
@@ -69,12 +72,12 @@ pub(super) async fn mjpeg(
         .watch(&*state.cameras, &camera_id(&name)?, view)
         .ok_or_else(|| Problem::unknown_camera(&name))?;
     let seat = state.seats.take()?;
-    let stop = state.sockets.stop.clone();
+    let (stop, pass) = (state.sockets.stop.clone(), Pass::new(&state.gate, identity));
     // One part at most waits for the connection, so what is sent is new.
     let (parts, body) = mpsc::channel::<Bytes>(1);
     tokio::spawn(async move {
         let _seat = seat;
-        feed(shots, parts, stop).await;
+        feed(shots, parts, stop, pass).await;
     });
     let headers = [
         (header::CONTENT_TYPE, format!("multipart/x-mixed-replace; boundary={BOUNDARY}")),
@@ -85,8 +88,13 @@ pub(super) async fn mjpeg(
 }
 
 /// Hands pictures to one MJPEG client. One that takes nothing for [`SEND_TIMEOUT`] is let go.
-async fn feed(mut shots: watch::Receiver<Option<Arc<Shot>>>, parts: mpsc::Sender<Bytes>, mut stop: Stop) {
-    loop {
+async fn feed(
+    mut shots: watch::Receiver<Option<Arc<Shot>>>,
+    parts: mpsc::Sender<Bytes>,
+    mut stop: Stop,
+    pass: Pass,
+) {
+    while pass.is_valid() {
         // Room first, then the picture: it is the newest at the moment when it can go.
         let room = tokio::select! {
             () = stop.stopped() => return,
@@ -129,6 +137,7 @@ async fn newest(shots: &mut watch::Receiver<Option<Arc<Shot>>>) -> Option<Arc<Sh
 pub(super) async fn live(
     State(state): State<ApiState>,
     Path(name): Path<String>,
+    Extension(identity): Extension<Option<Identity>>,
     headers: HeaderMap,
     upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
 ) -> Result<Response, Problem> {
@@ -139,11 +148,11 @@ pub(super) async fn live(
         .watch(&*state.cameras, &id, View::Plain)
         .ok_or_else(|| Problem::unknown_camera(&name))?;
     let seat = state.seats.take()?;
-    let sockets = state.sockets.clone();
+    let (sockets, pass) = (state.sockets.clone(), Pass::new(&state.gate, identity));
     let stream = PictureStream { shots, classes: state.hub.classes().clone() };
     Ok(upgrade.on_upgrade(|socket| async move {
         let _seat = seat;
-        socket::run(socket, sockets, stream).await;
+        socket::run(socket, sockets, pass, stream).await;
     }))
 }
 

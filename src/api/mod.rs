@@ -10,6 +10,7 @@
 //! /v1/cameras/{id}/lines[/{line}]  GET, POST, PUT, DELETE; zones likewise
 //! /v1/cameras/{id}/counts          crossings, occupancies
 //! /v1/cameras/{id}/heatmap         where people were
+//! /v1/session                      who asks; signing in and out
 //! /v1/tracks                       WebSocket: tracks as JSON or protobuf
 //! /v1/events[/live]                what happened at lines and in zones; a WebSocket of it
 //! /metrics /healthz /readyz
@@ -19,6 +20,7 @@
 //! docs/api.md is the reference for users.
 
 mod analytics;
+mod auth;
 mod cameras;
 mod events;
 mod live;
@@ -28,6 +30,7 @@ mod rest;
 mod rules;
 mod server;
 mod socket;
+mod ssrf;
 mod tracks;
 mod video;
 
@@ -35,14 +38,18 @@ use std::sync::Arc;
 
 use axum::Router;
 use axum::extract::DefaultBodyLimit;
+use axum::middleware::from_fn_with_state;
 use axum::routing::get;
 use prometheus::Registry;
+use tokio_rustls::rustls::ServerConfig;
 
+pub use auth::RIGHTS;
 pub use cameras::{CameraError, CameraState, CameraStatus, Cameras, NewCamera, TrackCounts, Transport};
 pub use rules::{AnchorSpec, EditError, Findings, LineSpec, Rule, RuleEdit, RulesSpec, ZoneSpec};
 pub use server::{serve, serve_with};
 pub use socket::KeepAlive;
 
+use crate::auth::Gate;
 use crate::publish::{EventHub, Hub};
 use socket::{Seats, Sockets};
 use video::Studio;
@@ -66,6 +73,10 @@ pub struct ApiConfig {
     pub registry: Registry,
     /// What `/readyz` asks.
     pub readiness: Readiness,
+    /// Who may come in.
+    pub gate: Arc<Gate>,
+    /// Certificate and key; without them it is plain HTTP.
+    pub tls: Option<Arc<ServerConfig>>,
 }
 
 /// What every handler can reach.
@@ -76,16 +87,19 @@ struct ApiState {
     events: EventHub,
     registry: Registry,
     readiness: Readiness,
+    gate: Arc<Gate>,
+    /// Whether connections are encrypted.
+    secure: bool,
     studio: Arc<Studio>,
     seats: Seats,
     sockets: Sockets,
 }
 
 fn router(config: ApiConfig, sockets: Sockets) -> Router {
-    let ApiConfig { cameras, hub, events, registry, readiness } = config;
+    let ApiConfig { cameras, hub, events, registry, readiness, gate, tls } = config;
     let studio = Arc::new(Studio::default());
-    let seats = Seats::default();
-    let state = ApiState { cameras, hub, events, registry, readiness, studio, seats, sockets };
+    let (seats, secure) = (Seats::default(), tls.is_some());
+    let state = ApiState { cameras, hub, events, registry, readiness, gate, secure, studio, seats, sockets };
     Router::new()
         .route("/v1/cameras", get(rest::list).post(rest::add))
         .route("/v1/cameras/{id}", get(rest::get).delete(rest::remove))
@@ -110,7 +124,9 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
         .route("/metrics", get(rest::metrics))
         .route("/healthz", get(rest::healthz))
         .route("/readyz", get(rest::readyz))
+        .route("/v1/session", get(auth::session).post(auth::sign_in).delete(auth::sign_out))
         .merge(page::routes())
+        .route_layer(from_fn_with_state(state.clone(), auth::guard))
         .fallback(rest::no_such_path)
         .method_not_allowed_fallback(rest::no_such_method)
         .layer(DefaultBodyLimit::max(MAX_BODY_BYTES))

@@ -66,6 +66,14 @@ impl Problem {
         Self::new(StatusCode::UPGRADE_REQUIRED, "websocket-only", "This path speaks WebSocket", detail)
     }
 
+    pub fn unauthenticated(detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::UNAUTHORIZED, "unauthenticated", "A token is needed", detail)
+    }
+
+    pub fn forbidden(detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::FORBIDDEN, "forbidden", "Not allowed", detail)
+    }
+
     pub fn forbidden_origin(detail: impl Into<String>) -> Self {
         Self::new(StatusCode::FORBIDDEN, "forbidden-origin", "Origin not allowed", detail)
     }
@@ -85,6 +93,10 @@ impl IntoResponse for Problem {
         response
             .headers_mut()
             .insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
+        if self.status == StatusCode::UNAUTHORIZED {
+            let scheme = HeaderValue::from_static("Bearer realm=\"gakp\"");
+            response.headers_mut().insert(header::WWW_AUTHENTICATE, scheme);
+        }
         response
     }
 }

@@ -1,17 +1,18 @@
 //! `/v1/cameras`, health, metrics.
 
-use axum::Json;
 use axum::body::Bytes;
 use axum::extract::rejection::BytesRejection;
 use axum::extract::{Path, State};
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use prometheus::{Encoder, TextEncoder};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::problem::Problem;
-use super::{ApiState, CameraStatus, MAX_BODY_BYTES, NewCamera};
+use super::{ApiState, CameraStatus, MAX_BODY_BYTES, NewCamera, ssrf};
+use crate::auth::{Identity, Role};
 use crate::types::CameraId;
 
 #[derive(Serialize)]
@@ -33,10 +34,14 @@ pub(super) async fn get(
 
 pub(super) async fn add(
     State(state): State<ApiState>,
+    Extension(identity): Extension<Option<Identity>>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Result<Response, Problem> {
     let request: NewCamera = json_body(&headers, body)?;
+    if identity.is_none_or(|identity| identity.role < Role::Admin) {
+        ssrf::check(&request.url).await?;
+    }
     let location = format!("/v1/cameras/{}", request.id);
     let status = state.cameras.add(request).await?;
     let mut response = (StatusCode::CREATED, Json(status)).into_response();

@@ -8,16 +8,20 @@ use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use socket2::SockRef;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
+use tokio_rustls::TlsAcceptor;
 
 use super::socket::{KeepAlive, Sockets};
 use super::{ApiConfig, router};
 
 /// Plain HTTP connections at a time, WebSockets not among them. More wait in the kernel's backlog.
 const MAX_CONNECTIONS: usize = 512;
+/// Longest head of a request, bytes.
+const MAX_HEAD: usize = 32 * 1024;
 /// How long a connection may take to send a request's head, and to sit idle between requests.
 const HEADER_TIMEOUT: Duration = Duration::from_secs(15);
 /// How long sent bytes may stay unacknowledged before the peer counts as dead.
@@ -71,6 +75,7 @@ pub async fn serve_with(
 ) -> io::Result<()> {
     listener.local_addr()?;
     let (stop, stopped) = watch::channel(false);
+    let tls = config.tls.clone().map(TlsAcceptor::from);
     let router = router(config, Sockets { keep_alive, stop: Stop(stopped.clone()) });
     let mut connections = JoinSet::new();
     let mut shutdown = std::pin::pin!(shutdown);
@@ -81,7 +86,7 @@ pub async fn serve_with(
             Some(_) = connections.join_next() => {}
             accepted = listener.accept(), if connections.len() < MAX_CONNECTIONS => match accepted {
                 Ok((stream, _)) => {
-                    connections.spawn(connection(stream, router.clone(), Stop(stopped.clone())));
+                    connections.spawn(connection(stream, tls.clone(), router.clone(), Stop(stopped.clone())));
                 }
                 Err(error) => {
                     // Out of file descriptors, or a peer that hung up at once: neither is the end.
@@ -103,7 +108,7 @@ pub async fn serve_with(
     Ok(())
 }
 
-async fn connection(stream: TcpStream, router: Router, mut stop: Stop) {
+async fn connection(stream: TcpStream, tls: Option<TlsAcceptor>, router: Router, mut stop: Stop) {
     // Frames and tracks are small and wanted at once. A peer that vanished without a word is found
     // by its bytes that nobody acknowledges.
     let _ = stream.set_nodelay(true);
@@ -113,9 +118,27 @@ async fn connection(stream: TcpStream, router: Router, mut stop: Stop) {
         let _ = socket.set_tcp_user_timeout(Some(PEER_TIMEOUT));
         let _ = socket.set_tcp_notsent_lowat(UNSENT);
     }
+    let Some(tls) = tls else { return converse(stream, router, stop).await };
+    let shaken = tokio::select! {
+        shaken = timeout(HEADER_TIMEOUT, tls.accept(stream)) => shaken,
+        () = stop.stopped() => return,
+    };
+    match shaken {
+        Ok(Ok(stream)) => converse(stream, router, stop).await,
+        Ok(Err(error)) => tracing::debug!(%error, "a TLS handshake failed"),
+        Err(_) => tracing::debug!("a TLS handshake took too long"),
+    }
+}
+
+/// Requests and answers over one connection.
+async fn converse(
+    stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    router: Router,
+    mut stop: Stop,
+) {
     let service = TowerToHyperService::new(router);
     let mut builder = http1::Builder::new();
-    builder.timer(TokioTimer::new()).header_read_timeout(HEADER_TIMEOUT);
+    builder.timer(TokioTimer::new()).header_read_timeout(HEADER_TIMEOUT).max_buf_size(MAX_HEAD);
     let mut connection =
         std::pin::pin!(builder.serve_connection(TokioIo::new(stream), service).with_upgrades());
     let ended = tokio::select! {

@@ -13,6 +13,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::problem::Problem;
 use super::server::Stop;
+use crate::auth::{Gate, Identity};
 
 /// Long-lived streams at a time (WebSockets and MJPEG).
 const MAX_STREAMS: usize = 256;
@@ -43,6 +44,23 @@ impl Default for KeepAlive {
 pub(super) struct Sockets {
     pub keep_alive: KeepAlive,
     pub stop: Stop,
+}
+
+/// Whose stream it is. A stream ends soon after its bearer's token.
+#[derive(Clone)]
+pub(super) struct Pass {
+    gate: Arc<Gate>,
+    identity: Option<Identity>,
+}
+
+impl Pass {
+    pub fn new(gate: &Arc<Gate>, identity: Option<Identity>) -> Self {
+        Self { gate: gate.clone(), identity }
+    }
+
+    pub fn is_valid(&self) -> bool {
+        self.identity.as_ref().is_some_and(|identity| self.gate.still_knows(identity))
+    }
 }
 
 /// Bounds the streams that are open at a time.
@@ -83,7 +101,7 @@ pub(super) fn upgrade(
     Ok(upgrade.max_message_size(MAX_INCOMING).max_frame_size(MAX_INCOMING))
 }
 
-fn same_origin(headers: &HeaderMap) -> bool {
+pub(super) fn same_origin(headers: &HeaderMap) -> bool {
     let Some(origin) = headers.get(header::ORIGIN) else { return true };
     let text = |value: &axum::http::HeaderValue| value.to_str().ok().map(str::to_ascii_lowercase);
     let Some(origin) = text(origin) else { return false };
@@ -105,7 +123,7 @@ pub(super) trait Outgoing: Send {
 }
 
 /// Sends what `outgoing` has until it ends, the peer goes, or the service stops.
-pub(super) async fn run(socket: WebSocket, sockets: Sockets, mut outgoing: impl Outgoing) {
+pub(super) async fn run(socket: WebSocket, sockets: Sockets, pass: Pass, mut outgoing: impl Outgoing) {
     let Sockets { keep_alive, mut stop } = sockets;
     let (mut sender, mut receiver) = socket.split();
     let mut ping = interval(keep_alive.ping_every);
@@ -126,6 +144,9 @@ pub(super) async fn run(socket: WebSocket, sockets: Sockets, mut outgoing: impl 
             _ = ping.tick() => {
                 if heard.elapsed() > keep_alive.dead_after {
                     return;
+                }
+                if !pass.is_valid() {
+                    break (close_code::POLICY, "the token was revoked");
                 }
                 Message::Ping(Default::default())
             }

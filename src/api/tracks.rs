@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 
+use axum::Extension;
 use axum::body::Bytes;
 use axum::extract::ws::rejection::WebSocketUpgradeRejection;
 use axum::extract::ws::{Message, Utf8Bytes, WebSocketUpgrade, close_code};
@@ -11,7 +12,8 @@ use axum::response::Response;
 
 use super::ApiState;
 use super::problem::Problem;
-use super::socket::{self, Outgoing};
+use super::socket::{self, Outgoing, Pass};
+use crate::auth::Identity;
 use crate::publish::{Event, Only, Subscription, encode_gap_json, encode_gap_protobuf};
 use crate::types::CameraId;
 
@@ -23,6 +25,7 @@ const PROTOBUF: &str = "gakp.v1.protobuf";
 pub(super) async fn tracks(
     State(state): State<ApiState>,
     Query(query): Query<Vec<(String, String)>>,
+    Extension(identity): Extension<Option<Identity>>,
     headers: HeaderMap,
     upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
 ) -> Result<Response, Problem> {
@@ -33,12 +36,12 @@ pub(super) async fn tracks(
         Some(protocol) if protocol == PROTOBUF => Format::Protobuf,
         _ => Format::Json,
     };
-    let sockets = state.sockets.clone();
+    let (sockets, pass) = (state.sockets.clone(), Pass::new(&state.gate, identity));
     // Subscribed before the answer goes out: nothing published after the handshake is missed.
     let stream = TrackStream { subscription: state.hub.subscribe(only), format };
     Ok(upgrade.on_upgrade(|socket| async move {
         let _seat = seat;
-        socket::run(socket, sockets, stream).await;
+        socket::run(socket, sockets, pass, stream).await;
     }))
 }
 

@@ -16,6 +16,8 @@ mod signals;
 pub mod simulate;
 pub mod split;
 #[cfg(feature = "service")]
+pub mod token;
+#[cfg(feature = "service")]
 pub mod track;
 #[cfg(feature = "learn")]
 pub mod train;
@@ -45,6 +47,9 @@ pub enum Command {
     /// Run the service: cameras in, tracks out.
     #[cfg(feature = "service")]
     Serve(serve::Args),
+    /// Make, list and revoke the tokens that the API asks for.
+    #[cfg(feature = "service")]
+    Token(token::Args),
     /// Track a video, a URL or a MOTChallenge sequence, and write MOTChallenge rows.
     #[cfg(feature = "service")]
     Track(track::Args),
@@ -80,6 +85,8 @@ pub fn run(cli: Cli) -> anyhow::Result<()> {
     match cli.command {
         #[cfg(feature = "service")]
         Command::Serve(args) => serve::run(args),
+        #[cfg(feature = "service")]
+        Command::Token(args) => token::run(args),
         #[cfg(feature = "service")]
         Command::Track(args) => track::run(args),
         Command::Eval(args) => eval::run(args),

@@ -8,10 +8,12 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail};
 use tokio::net::TcpListener;
 use tokio::sync::oneshot;
+use tokio_rustls::rustls::ServerConfig;
 
 use super::models::ModelArgs;
 use super::signals::Signals;
 use crate::api::{self, ApiConfig, NewCamera};
+use crate::auth::{Gate, TokenFile, tls};
 use crate::config::{Config, TrackerOptions};
 use crate::infer::Models;
 use crate::pipeline::{CameraSet, Lanes, MAX_CAMERAS, SetConfig, Store, source_spec};
@@ -44,6 +46,15 @@ pub struct Args {
     /// or ~/.local/state/gakp].
     #[arg(long, value_name = "DIR")]
     state_dir: Option<PathBuf>,
+    /// Certificate chain (PEM): serve HTTPS and WSS.
+    #[arg(long, value_name = "FILE")]
+    tls_cert: Option<PathBuf>,
+    /// Private key of the certificate (PEM).
+    #[arg(long, value_name = "FILE")]
+    tls_key: Option<PathBuf>,
+    /// File with an admin's token of at least 32 characters, for secrets of containers; besides those of `gakp token`.
+    #[arg(long, env = "GAKP_ADMIN_TOKEN_FILE", value_name = "FILE")]
+    admin_token_file: Option<PathBuf>,
     /// Most cameras at a time [default: 64].
     #[arg(long, value_name = "N")]
     max_cameras: Option<usize>,
@@ -80,6 +91,8 @@ struct Plan {
     listen: SocketAddr,
     cameras: Vec<NewCamera>,
     store: (Store, crate::pipeline::Remembered),
+    gate: Gate,
+    tls: Option<Arc<ServerConfig>>,
     limit: usize,
     tracker: TrackerOptions,
     models: crate::infer::ModelSettings,
@@ -113,10 +126,31 @@ impl Plan {
         let state_dir = args.state_dir.or(config.state_dir).or_else(default_state_dir).context(
             "no state folder: neither STATE_DIRECTORY nor XDG_STATE_HOME nor HOME is set; give --state-dir",
         )?;
+        let listen = args.listen.or(config.listen).unwrap_or(SocketAddr::from(([127, 0, 0, 1], 8080)));
+        let local = listen.ip().is_loopback();
+        let store = Store::open(&state_dir)?;
+        let mut gate = Gate::new(TokenFile::path(&state_dir), local)?;
+        if let Some(file) = args.admin_token_file.or(config.admin_token_file) {
+            gate.admit_admin(&file)?;
+        }
+        if !local && !gate.has_tokens() {
+            bail!(
+                "{listen} can be reached from the network, and there is no token yet: everybody could see and change \
+                 everything. Make one with `gakp token create NAME --role admin --state-dir {}`, or listen on 127.0.0.1",
+                state_dir.display()
+            );
+        }
+        let tls = match (args.tls_cert.or(config.tls_cert), args.tls_key.or(config.tls_key)) {
+            (Some(cert), Some(key)) => Some(tls::load(&cert, &key)?),
+            (None, None) => None,
+            _ => bail!("--tls-cert and --tls-key belong together: one of them is missing"),
+        };
         Ok(Self {
-            listen: args.listen.or(config.listen).unwrap_or(SocketAddr::from(([127, 0, 0, 1], 8080))),
+            listen,
+            gate,
+            tls,
             cameras,
-            store: Store::open(&state_dir)?,
+            store,
             limit,
             tracker,
             models: crate::config::ModelConfig::from(args.models).or(config.models).settings()?,
@@ -195,7 +229,8 @@ async fn start(plan: Plan) -> Result<Service> {
         set.start_configured(camera).await.with_context(|| format!("camera {:?}", id.as_str()))?;
     }
     set.start_remembered().await;
-    tracing::info!("the page is at http://{address}/");
+    let scheme = if plan.tls.is_some() { "https" } else { "http" };
+    tracing::info!("the page is at {scheme}://{address}/");
     let config = ApiConfig {
         cameras: set.clone(),
         hub,
@@ -203,6 +238,8 @@ async fn start(plan: Plan) -> Result<Service> {
         registry: metrics.registry().clone(),
         // Models are warm before the port is bound: who can ask finds the service ready.
         readiness: Arc::new(Vec::new),
+        gate: Arc::new(plan.gate),
+        tls: plan.tls,
     };
     Ok(Service { listener, config, set })
 }
@@ -218,7 +255,7 @@ fn camera(text: &str, looped: bool) -> Result<NewCamera> {
     Ok(NewCamera { id, url: url.into(), transport: None, looped, lines: vec![], zones: vec![] })
 }
 
-fn default_state_dir() -> Option<PathBuf> {
+pub(super) fn default_state_dir() -> Option<PathBuf> {
     let set = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
     set("STATE_DIRECTORY")
         .or_else(|| set("XDG_STATE_HOME").map(|dir| dir.join("gakp")))

@@ -91,6 +91,14 @@ impl SourceUrl {
         }
     }
 
+    /// Host and port of an RTSP camera; `None` for anything else.
+    pub fn rtsp_host(&self) -> Option<(&str, u16)> {
+        match &self.location {
+            Location::Rtsp { host, port, .. } => Some((host, *port)),
+            _ => None,
+        }
+    }
+
     fn plain(text: &str, location: Location) -> Self {
         Self { full: text.to_owned(), redacted: text.to_owned(), secrets: Vec::new(), location }
     }

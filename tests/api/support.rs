@@ -14,6 +14,7 @@ use gakp::api::{
     ApiConfig, CameraError, CameraState, CameraStatus, Cameras, Findings, KeepAlive, NewCamera, RuleEdit,
     TrackCounts,
 };
+use gakp::auth::Gate;
 use gakp::publish::{EventHub, Hub, HubConfig, Picture};
 use gakp::types::{
     BBox, CameraId, CaptureTime, ClassId, Clock, Epoch, Frame, FrameTracks, Image, MediaTime, Plane, TrackId,
@@ -24,6 +25,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
+use tokio_rustls::rustls::ServerConfig;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::{Error as WsError, Message};
 use tokio_tungstenite::{WebSocketStream, client_async};
@@ -85,6 +87,11 @@ impl FakeCameras {
         };
         self.cameras.lock().unwrap().insert(id(name), (status.clone(), watch::channel(None).0));
         status
+    }
+
+    /// As if it had never been.
+    pub fn clear(&self, name: &str) {
+        self.cameras.lock().unwrap().remove(&id(name));
     }
 
     pub fn change(&self, name: &str, change: impl FnOnce(&mut CameraStatus)) {
@@ -189,11 +196,29 @@ impl Server {
         Self::start_on("127.0.0.1:0".parse().unwrap(), Arc::default(), hub, keep_alive).await
     }
 
+    /// With tokens, or TLS.
+    pub async fn start_behind(gate: Gate, tls: Option<Arc<ServerConfig>>) -> Self {
+        let addr = "127.0.0.1:0".parse().unwrap();
+        let keep_alive = KeepAlive { ping_every: Duration::from_millis(200), ..KeepAlive::default() };
+        Self::start_all(addr, Arc::default(), HubConfig::default(), keep_alive, gate, tls).await
+    }
+
     pub async fn start_on(
         addr: SocketAddr,
         cameras: Arc<FakeCameras>,
         hub: HubConfig,
         keep_alive: KeepAlive,
+    ) -> Self {
+        Self::start_all(addr, cameras, hub, keep_alive, Gate::open(), None).await
+    }
+
+    async fn start_all(
+        addr: SocketAddr,
+        cameras: Arc<FakeCameras>,
+        hub: HubConfig,
+        keep_alive: KeepAlive,
+        gate: Gate,
+        tls: Option<Arc<ServerConfig>>,
     ) -> Self {
         let listener = TcpListener::bind(addr).await.unwrap();
         let addr = listener.local_addr().unwrap();
@@ -212,6 +237,8 @@ impl Server {
                 true => vec![],
                 false => vec!["the detector is not loaded".to_owned()],
             }),
+            gate: Arc::new(gate),
+            tls,
         };
         let (stop, stopped) = oneshot::channel();
         let done = tokio::spawn(gakp::api::serve_with(listener, config, keep_alive, async {

@@ -78,6 +78,7 @@ fn wrong_settings_are_told_before_anything_starts() {
     let config = |text: &str| service.file("gakp.toml", text);
     let missing = service.folder.path().join("missing.mp4");
     let missing = format!("a={}", missing.display());
+    let short = service.file("short", "not a secret");
     for (args, expected) in [
         (vec!["--camera", "a=ftp://u:hunter2@host/x"], vec!["camera \"a\"", "no scheme `ftp`", "rtsp://"]),
         (vec!["--camera", "a=rtsp:/u:hunter2@host"], vec!["camera \"a\"", "`rtsp://...`"]),
@@ -90,6 +91,18 @@ fn wrong_settings_are_told_before_anything_starts() {
         (vec!["--threads", "0"], vec!["threads is 0"]),
         (vec!["--provider", "gpu"], vec!["provider", "\"gpu\"", "auto, cpu, cuda, tensorrt"]),
         (vec!["--listen", "localhost"], vec!["--listen", "localhost"]),
+        (
+            vec!["--listen", "0.0.0.0:0"],
+            vec!["0.0.0.0:0", "no token yet", "gakp token create NAME --role admin"],
+        ),
+        (vec!["--listen", "[::]:0"], vec!["no token yet"]),
+        (vec!["--tls-cert", &missing], vec!["--tls-key"]),
+        (
+            vec!["--tls-cert", &missing, "--tls-key", &missing],
+            vec!["cannot read a certificate", "missing.mp4"],
+        ),
+        (vec!["--admin-token-file", &missing], vec!["the admin's token", "missing.mp4"]),
+        (vec!["--admin-token-file", &short], vec!["32 or more visible ASCII characters"]),
         (vec!["--no-such-flag"], vec!["--no-such-flag"]),
         (vec!["--config", "nowhere.toml"], vec!["configuration nowhere.toml", "No such file"]),
         (vec!["--log", "loud"], vec!["--log \"loud\"", "error, warn, info, debug, trace"]),

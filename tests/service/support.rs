@@ -278,10 +278,19 @@ impl Service {
         self.request("DELETE", path, None)
     }
 
-    /// HTTP/1.0: the answer ends with the connection and has no chunks.
     pub fn request(&self, method: &str, path: &str, json: Option<&str>) -> Response {
+        self.request_with("", method, path, json)
+    }
+
+    /// By the bearer of a token.
+    pub fn request_as(&self, token: &str, method: &str, path: &str, json: Option<&str>) -> Response {
+        self.request_with(&format!("Authorization: Bearer {token}\r\n"), method, path, json)
+    }
+
+    /// HTTP/1.0: the answer ends with the connection and has no chunks.
+    fn request_with(&self, headers: &str, method: &str, path: &str, json: Option<&str>) -> Response {
         let mut stream = connect(self.address);
-        let mut head = format!("{method} {path} HTTP/1.0\r\nHost: {}\r\n", self.address);
+        let mut head = format!("{method} {path} HTTP/1.0\r\nHost: {}\r\n{headers}", self.address);
         if let Some(json) = json {
             head += &format!("Content-Type: application/json\r\nContent-Length: {}\r\n", json.len());
         }

@@ -15,10 +15,62 @@ async function api(path, options = {}) {
   const response = await fetch(path, { ...options, cache: "no-store", signal: AbortSignal.timeout(15000) });
   if (response.ok) return response.status === 204 ? null : response.json();
   const problem = await response.json().catch(() => null);
+  if (response.status === 401 && path !== "/v1/session") askForToken();
   const error = new Error(problem?.detail ?? `The service answered ${response.status}.`);
   error.answered = true;
   throw error;
 }
+
+// Who is at the page, and what may be done from it.
+let session = null;
+
+async function learnWhoIAm() {
+  session = await api("/v1/session");
+  const known = session.role !== null;
+  const may = (...roles) => known && roles.includes(session.role);
+  document.body.dataset.role = session.role ?? "nobody";
+  $("#login").hidden = known;
+  $("#main").hidden = !known;
+  $("#who").hidden = !known || session.auth === "open";
+  $("#who span").textContent = known ? `${session.name} (${session.role})` : "";
+  $(".add").hidden = !may("operator", "admin");
+  if (!known) $("#summary").textContent = "Not signed in";
+  refreshViews();
+}
+
+function askForToken() {
+  if (session?.role == null) return;
+  session = { ...session, role: null };
+  for (const { view } of cards.values()) view.want(false);
+  learnWhoIAm().catch(console.error);
+}
+
+$("#login").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const { token } = event.target.elements;
+  const result = $("#login-result");
+  result.textContent = "";
+  try {
+    await api("/v1/session", {
+      method: "POST",
+      headers: { "Content-Type": "application/json" },
+      body: JSON.stringify({ token: token.value }),
+    });
+    token.value = "";
+    await learnWhoIAm();
+    await poll();
+  } catch (error) {
+    result.textContent = error.answered ? error.message : "The service does not answer.";
+  }
+});
+
+$("#sign-out").addEventListener("click", async () => {
+  await api("/v1/session", { method: "DELETE" }).catch(console.error);
+  session = { ...session, role: null };
+  for (const { view } of cards.values()) view.want(false);
+  show([]);
+  await learnWhoIAm();
+});
 
 // Pictures cost the service work: only for cards that can be seen.
 const inSight = new IntersectionObserver((entries) => {
@@ -30,7 +82,7 @@ const inSight = new IntersectionObserver((entries) => {
 });
 
 function refreshViews() {
-  for (const { view, inSight } of cards.values()) view.want(inSight && !document.hidden);
+  for (const { view, inSight } of cards.values()) view.want(inSight && !document.hidden && session?.video === true);
 }
 document.addEventListener("visibilitychange", refreshViews);
 
@@ -80,7 +132,9 @@ function showCamera(card, camera) {
   set(".state", (WORDS[camera.state] ?? camera.state) + (retry ? ` in ${Math.ceil(camera.next_retry_s)} s` : ""));
   set(".url", camera.url);
   set(".error", camera.state === "live" || !camera.last_error ? "" : camera.last_error);
-  set(".note", camera.state === "live" ? "" : `This camera is ${WORDS[camera.state] ?? camera.state}.`);
+  const unseen = session?.video === false ? "Your token may not see pictures." : "";
+  set(".note", camera.state === "live" ? unseen : `This camera is ${WORDS[camera.state] ?? camera.state}.`);
+  element.querySelector(".delete").hidden = session?.role === "viewer";
   set(".rate", camera.fps == null ? "-" : `${camera.fps.toFixed(1)} /s`);
   set(".size", camera.width && camera.height ? `${camera.width} x ${camera.height}` : "-");
   const dropped = Object.values(camera.dropped).reduce((sum, n) => sum + n, 0);
@@ -114,6 +168,7 @@ function show(cameras) {
 
 let asked = 0;
 async function poll() {
+  if (session?.role == null) return;
   const turn = ++asked;
   try {
     const { cameras } = await api("/v1/cameras");
@@ -152,6 +207,9 @@ $("#add").addEventListener("submit", async (event) => {
 
 async function forever() {
   for (;;) {
+    if (session === null) {
+      await learnWhoIAm().catch(() => ($("#offline").hidden = false));
+    }
     if (!document.hidden) await poll();
     await new Promise((resolve) => setTimeout(resolve, POLL_MS));
   }
