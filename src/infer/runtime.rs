@@ -269,6 +269,7 @@ fn environment(setting: Option<&Path>, models: &Path) -> Result<(PathBuf, Enviro
             match ort::init_from(&path) {
                 Ok(builder) => {
                     let environment =
+                        // The library's own telemetry minds its environment variable alone: `main` sets it.
                         builder.with_name("gakp").with_telemetry(false).build().map_err(|error| {
                             InferError::Library { tried: format!("{}: {error}", path.display()) }
                         })?;

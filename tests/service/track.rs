@@ -133,7 +133,12 @@ fn a_sequence_folder_needs_no_video() {
     let folder = tempfile::tempdir().unwrap();
     let (one, two) = (sequence(folder.path(), "ONE", 60), sequence(folder.path(), "TWO", 40));
     let out = folder.path().join("one.txt");
-    track(&[&one, "--out", out.to_str().unwrap()]);
+    let home = tempfile::tempdir().unwrap();
+    let env = [("HOME", home.path().to_str().unwrap()), ("XDG_CACHE_HOME", "")];
+    let ended = run_to_end(&["track", &one, "--out", out.to_str().unwrap()], &env);
+    assert!(ended.status.success(), "{}", String::from_utf8_lossy(&ended.stderr));
+    // ONNX Runtime's telemetry keeps an identity there.
+    assert!(!home.path().join(".cache/Microsoft").exists(), "nothing is prepared to be told to others");
     let rows = rows(&out, 60);
     for frame in 10..=60 {
         let ids: Vec<_> = rows.iter().filter(|row| row.frame == frame).map(|row| row.id).collect();
