@@ -23,7 +23,7 @@ const VIEW: Right = Right::Role(Role::Viewer);
 const CHANGE: Right = Right::Role(Role::Operator);
 
 /// What each route asks for. One that is not here asks for an admin. `HEAD` asks for what `GET` does.
-pub const RIGHTS: [(&str, &str, Right); 29] = [
+pub const RIGHTS: [(&str, &str, Right); 30] = [
     ("GET", "/v1/cameras", VIEW),
     ("POST", "/v1/cameras", CHANGE),
     ("GET", "/v1/cameras/{id}", VIEW),
@@ -44,6 +44,7 @@ pub const RIGHTS: [(&str, &str, Right); 29] = [
     ("GET", "/v1/cameras/{id}/counts", VIEW),
     ("GET", "/v1/cameras/{id}/heatmap", VIEW),
     ("GET", "/v1/tracks", VIEW),
+    ("GET", "/v1/tracks/stream", VIEW),
     ("GET", "/v1/events", VIEW),
     ("GET", "/v1/events/live", VIEW),
     ("GET", "/v1/session", Right::Nobody),

@@ -1,24 +1,21 @@
 //! Pictures of a camera: a snapshot, MJPEG for anything that shows it, a WebSocket for the page.
 
-use std::convert::Infallible;
 use std::sync::Arc;
 
 use axum::Extension;
-use axum::body::{Body, Bytes};
+use axum::body::Bytes;
 use axum::extract::ws::rejection::WebSocketUpgradeRejection;
 use axum::extract::ws::{Message, WebSocketUpgrade, close_code};
 use axum::extract::{Path, Query, State};
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
-use futures::stream::unfold;
-use tokio::sync::{mpsc, watch};
-use tokio::time::timeout;
+use tokio::sync::watch;
 
 use super::ApiState;
+use super::drip::{self, Parts};
 use super::problem::Problem;
 use super::rest::camera_id;
-use super::server::Stop;
-use super::socket::{self, Outgoing, Pass, SEND_TIMEOUT};
+use super::socket::{self, Outgoing, Pass};
 use super::video::{Shot, View};
 use crate::auth::Identity;
 use crate::publish::encode_json;
@@ -73,41 +70,19 @@ pub(super) async fn mjpeg(
         .ok_or_else(|| Problem::unknown_camera(&name))?;
     let seat = state.seats.take()?;
     let (stop, pass) = (state.sockets.stop.clone(), Pass::new(&state.gate, identity));
-    // One part at most waits for the connection, so what is sent is new.
-    let (parts, body) = mpsc::channel::<Bytes>(1);
-    tokio::spawn(async move {
-        let _seat = seat;
-        feed(shots, parts, stop, pass).await;
-    });
     let headers = [
         (header::CONTENT_TYPE, format!("multipart/x-mixed-replace; boundary={BOUNDARY}")),
         (header::CACHE_CONTROL, "no-store".to_owned()),
     ];
-    let body = unfold(body, async |mut body| Some((Ok::<_, Infallible>(body.recv().await?), body)));
-    Ok((headers, Body::from_stream(body)).into_response())
+    Ok((headers, drip::body(Film(shots), stop, pass, seat)).into_response())
 }
 
-/// Hands pictures to one MJPEG client. One that takes nothing for [`SEND_TIMEOUT`] is let go.
-async fn feed(
-    mut shots: watch::Receiver<Option<Arc<Shot>>>,
-    parts: mpsc::Sender<Bytes>,
-    mut stop: Stop,
-    pass: Pass,
-) {
-    while pass.is_valid() {
-        // Room first, then the picture: it is the newest at the moment when it can go.
-        let room = tokio::select! {
-            () = stop.stopped() => return,
-            room = timeout(SEND_TIMEOUT, parts.reserve()) => room,
-        };
-        let Ok(Ok(room)) = room else { return };
-        let shot = tokio::select! {
-            () = stop.stopped() => return,
-            () = parts.closed() => return,
-            shot = newest(&mut shots) => shot,
-        };
-        let Some(shot) = shot else { return };
-        room.send(part(&shot));
+/// The parts of an MJPEG stream.
+struct Film(watch::Receiver<Option<Arc<Shot>>>);
+
+impl Parts for Film {
+    async fn next(&mut self) -> Option<Bytes> {
+        Some(part(&*newest(&mut self.0).await?))
     }
 }
 

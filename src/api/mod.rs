@@ -12,6 +12,7 @@
 //! /v1/cameras/{id}/heatmap         where people were
 //! /v1/session                      who asks; signing in and out
 //! /v1/tracks                       WebSocket: tracks as JSON or protobuf
+//! /v1/tracks/stream                the same as Server-Sent Events
 //! /v1/events[/live]                what happened at lines and in zones; a WebSocket of it
 //! /metrics /healthz /readyz
 //! ```
@@ -22,6 +23,7 @@
 mod analytics;
 mod auth;
 mod cameras;
+mod drip;
 mod events;
 mod live;
 mod page;
@@ -119,6 +121,7 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
         .route("/v1/cameras/{id}/counts", get(analytics::counts))
         .route("/v1/cameras/{id}/heatmap", get(analytics::heat_map))
         .route("/v1/tracks", get(tracks::tracks))
+        .route("/v1/tracks/stream", get(tracks::stream))
         .route("/v1/events", get(events::recent))
         .route("/v1/events/live", get(events::live))
         .route("/metrics", get(rest::metrics))

@@ -1,26 +1,35 @@
-//! `/v1/tracks`: the track stream as JSON or protobuf.
+//! `/v1/tracks`: the track stream as JSON or protobuf; `/v1/tracks/stream`: as Server-Sent Events.
 
 use std::collections::BTreeSet;
+use std::sync::Arc;
+use std::time::Duration;
 
 use axum::Extension;
 use axum::body::Bytes;
 use axum::extract::ws::rejection::WebSocketUpgradeRejection;
 use axum::extract::ws::{Message, Utf8Bytes, WebSocketUpgrade, close_code};
 use axum::extract::{Query, State};
-use axum::http::HeaderMap;
-use axum::response::Response;
+use axum::http::{HeaderMap, header};
+use axum::response::{IntoResponse, Response};
+use tokio::time::timeout;
 
 use super::ApiState;
+use super::drip::{self, Parts};
 use super::problem::Problem;
 use super::socket::{self, Outgoing, Pass};
 use crate::auth::Identity;
-use crate::publish::{Event, Only, Subscription, encode_gap_json, encode_gap_protobuf};
-use crate::types::CameraId;
+use crate::publish::{
+    Event, Only, Sieve, Sifted, Subscription, TrackFilter, encode_gap_json, encode_gap_protobuf, encode_json,
+    encode_protobuf,
+};
+use crate::types::{CameraId, ClassId, TrackState};
 
 /// Subprotocol of JSON text messages, which is also what a client gets that names none.
 const JSON: &str = "gakp.v1.json";
 /// Subprotocol of binary `gakp.v1.TrackMessage`s.
 const PROTOBUF: &str = "gakp.v1.protobuf";
+/// After so long without an event a comment is sent.
+const SILENCE: Duration = Duration::from_secs(10);
 
 pub(super) async fn tracks(
     State(state): State<ApiState>,
@@ -30,7 +39,7 @@ pub(super) async fn tracks(
     upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
 ) -> Result<Response, Problem> {
     let upgrade = socket::upgrade(&headers, upgrade)?.protocols([PROTOBUF, JSON]);
-    let only = only(&state, &query)?;
+    let (only, filter) = wishes(&state, &query)?;
     let seat = state.seats.take()?;
     let format = match upgrade.selected_protocol() {
         Some(protocol) if protocol == PROTOBUF => Format::Protobuf,
@@ -38,27 +47,69 @@ pub(super) async fn tracks(
     };
     let (sockets, pass) = (state.sockets.clone(), Pass::new(&state.gate, identity));
     // Subscribed before the answer goes out: nothing published after the handshake is missed.
-    let stream = TrackStream { subscription: state.hub.subscribe(only), format };
+    let stream = Messages::new(&state, only, filter, format);
     Ok(upgrade.on_upgrade(|socket| async move {
         let _seat = seat;
-        socket::run(socket, sockets, pass, stream).await;
+        socket::run(socket, sockets, pass, TrackSocket(stream)).await;
     }))
 }
 
-/// The cameras named by `?camera=`, which may repeat; all when there is none.
-fn only(state: &ApiState, query: &[(String, String)]) -> Result<Only, Problem> {
-    let mut cameras = BTreeSet::new();
+/// `GET /v1/tracks/stream`: Server-Sent Events, `tracks` and `gap`, each with a JSON message.
+pub(super) async fn stream(
+    State(state): State<ApiState>,
+    Query(query): Query<Vec<(String, String)>>,
+    Extension(identity): Extension<Option<Identity>>,
+) -> Result<Response, Problem> {
+    let (only, filter) = wishes(&state, &query)?;
+    let seat = state.seats.take()?;
+    let (stop, pass) = (state.sockets.stop.clone(), Pass::new(&state.gate, identity));
+    let events = ServerSent(Messages::new(&state, only, filter, Format::Json));
+    let headers = [(header::CONTENT_TYPE, "text/event-stream"), (header::CACHE_CONTROL, "no-store")];
+    Ok((headers, drip::body(events, stop, pass, seat)).into_response())
+}
+
+/// Which cameras, and what of their reports.
+fn wishes(state: &ApiState, query: &[(String, String)]) -> Result<(Only, TrackFilter), Problem> {
+    let (mut cameras, mut filter) = (BTreeSet::new(), TrackFilter::default());
     for (key, value) in query {
-        if key != "camera" {
-            return Err(Problem::bad_request(format!("unknown parameter {key:?}; there is `camera`")));
+        let wrong = |what: String| Err(Problem::bad_request(format!("{key}={value:?} {what}")));
+        match key.as_str() {
+            "camera" => {
+                let id = CameraId::new(value)?;
+                if state.cameras.get(&id).is_none() {
+                    return Err(Problem::unknown_camera(value));
+                }
+                cameras.insert(id);
+            }
+            "class" => match state.hub.classes().iter().position(|class| class == value) {
+                Some(class) => {
+                    // The manifest bounds the number of classes.
+                    filter.classes.insert(ClassId(class as u16));
+                }
+                None => return wrong(format!("is none of the classes {}", state.hub.classes().join(", "))),
+            },
+            "state" => match TrackState::ALL.into_iter().find(|state| state.as_str() == value) {
+                Some(state) => {
+                    filter.states.insert(state);
+                }
+                None => return wrong("is none of tentative, confirmed, lost".into()),
+            },
+            "min_confidence" => match value.parse() {
+                Ok(least) if (0.0..=1.0).contains(&least) => filter.min_confidence = least,
+                _ => return wrong("must be a number from 0 to 1".into()),
+            },
+            "rate" => match value.parse() {
+                Ok(rate) if (0.01..=1000.0).contains(&rate) => filter.rate = Some(rate),
+                _ => return wrong("must be reports per second, from 0.01 to 1000".into()),
+            },
+            _ => {
+                return Err(Problem::bad_request(format!(
+                    "unknown parameter {key:?}; there are `camera`, `class`, `state`, `min_confidence` and `rate`"
+                )));
+            }
         }
-        let id = CameraId::new(value)?;
-        if state.cameras.get(&id).is_none() {
-            return Err(Problem::unknown_camera(value));
-        }
-        cameras.insert(id);
     }
-    Ok(if cameras.is_empty() { Only::All } else { Only::Cameras(cameras) })
+    Ok((if cameras.is_empty() { Only::All } else { Only::Cameras(cameras) }, filter))
 }
 
 #[derive(Clone, Copy)]
@@ -67,28 +118,82 @@ enum Format {
     Protobuf,
 }
 
-struct TrackStream {
-    subscription: Subscription,
-    format: Format,
+/// A message to a subscriber.
+enum Told {
+    Tracks(Bytes),
+    Gap(Bytes),
 }
 
-impl Outgoing for TrackStream {
+/// One subscriber's messages, encoded.
+struct Messages {
+    subscription: Subscription,
+    sieve: Sieve,
+    format: Format,
+    classes: Arc<[String]>,
+}
+
+impl Messages {
+    fn new(state: &ApiState, only: Only, filter: TrackFilter, format: Format) -> Self {
+        let (subscription, classes) = (state.hub.subscribe(only), state.hub.classes().clone());
+        Self { subscription, sieve: Sieve::new(filter), format, classes }
+    }
+
+    /// Cancel safe: what was taken from the hub is told before anything is awaited again.
+    async fn next(&mut self) -> Option<Told> {
+        loop {
+            let report = match self.subscription.next().await? {
+                Event::Tracks(report) => report,
+                Event::Gap(gap) => {
+                    return Some(Told::Gap(match self.format {
+                        Format::Json => encode_gap_json(&gap),
+                        Format::Protobuf => encode_gap_protobuf(&gap),
+                    }));
+                }
+            };
+            let Some(sifted) = self.sieve.sift(report) else { continue };
+            return Some(Told::Tracks(match (self.format, sifted) {
+                (Format::Json, Sifted::Whole(report)) => report.json(),
+                (Format::Json, Sifted::Part(tracks)) => encode_json(&tracks, &self.classes),
+                (Format::Protobuf, Sifted::Whole(report)) => report.protobuf(),
+                (Format::Protobuf, Sifted::Part(tracks)) => encode_protobuf(&tracks, &self.classes),
+            }));
+        }
+    }
+}
+
+struct TrackSocket(Messages);
+
+impl Outgoing for TrackSocket {
     async fn next(&mut self) -> Option<Message> {
-        let event = self.subscription.next().await?;
-        match (self.format, event) {
-            (Format::Json, Event::Tracks(report)) => text(report.json()),
-            (Format::Json, Event::Gap(gap)) => text(encode_gap_json(&gap)),
-            (Format::Protobuf, Event::Tracks(report)) => Some(Message::Binary(report.protobuf())),
-            (Format::Protobuf, Event::Gap(gap)) => Some(Message::Binary(encode_gap_protobuf(&gap))),
+        let (Told::Tracks(message) | Told::Gap(message)) = self.0.next().await?;
+        match self.0.format {
+            Format::Json => text(message),
+            Format::Protobuf => Some(Message::Binary(message)),
         }
     }
 
     fn farewell(&self) -> (u16, &'static str) {
-        if self.subscription.given_up() {
+        if self.0.subscription.given_up() {
             (close_code::POLICY, "too slow: missed more than can be accounted for")
         } else {
             (close_code::AWAY, "the service stops")
         }
+    }
+}
+
+struct ServerSent(Messages);
+
+impl Parts for ServerSent {
+    async fn next(&mut self) -> Option<Bytes> {
+        let (name, json) = match timeout(SILENCE, self.0.next()).await {
+            Ok(Some(Told::Tracks(json))) => ("tracks", json),
+            Ok(Some(Told::Gap(json))) => ("gap", json),
+            Ok(None) => return None,
+            // A comment: proxies close what is silent, and a client that went is found by what it does not take.
+            Err(_) => return Some(Bytes::from_static(b":\n\n")),
+        };
+        // JSON as we write it has no line break.
+        Some([format!("event: {name}\ndata: ").as_bytes(), &json, b"\n\n"].concat().into())
     }
 }
 

@@ -7,6 +7,7 @@
 
 mod draw;
 mod event;
+mod filter;
 mod hub;
 mod json;
 mod picture;
@@ -15,6 +16,7 @@ mod report;
 
 pub use draw::{Trails, annotate, colour};
 pub use event::{EVENT_KINDS, EventFilter, EventHub, EventListener, Heard, NumberedEvent, event_kind};
+pub use filter::{Sieve, Sifted, TrackFilter};
 pub use hub::{Event, Gap, Hub, HubConfig, HubMetrics, Only, Subscription};
 pub use picture::{Picture, PictureError, Rgb, RgbConverter};
 pub use protobuf::wire;

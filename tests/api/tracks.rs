@@ -7,9 +7,10 @@ use futures::SinkExt;
 use gakp::api::KeepAlive;
 use gakp::publish::HubConfig;
 use gakp::publish::wire::{self, track_message::Message as Payload};
-use gakp::types::{BBox, FrameTracks, TrackReport};
+use gakp::types::{BBox, FrameTracks, TrackId, TrackReport};
 use prost::Message as _;
 use serde_json::json;
+use tokio::io::AsyncReadExt as _;
 use tokio_tungstenite::tungstenite::Message;
 
 use super::support::*;
@@ -89,6 +90,58 @@ async fn a_filter_lets_only_its_cameras_through() {
 }
 
 #[tokio::test]
+async fn tracks_are_chosen_and_thinned() {
+    let server = two_cameras().await;
+    let mut people =
+        server.socket("/v1/tracks?class=person&state=confirmed&min_confidence=0.5", &[]).await.ok().unwrap();
+    let mut cars = server.socket("/v1/tracks?class=car", &[]).await.ok().unwrap();
+    let mut slow = server.socket("/v1/tracks?camera=gate&rate=5", &[]).await.ok().unwrap();
+    for seq in 0..11 {
+        let mut report = FrameTracks::clone(&report("gate", seq));
+        report.ended = vec![TrackId(100 + seq)];
+        server.hub.publish(Arc::new(report));
+    }
+    let message = people.json().await;
+    assert_eq!((message["seq"].as_u64(), message["tracks"][0]["id"].as_u64()), (Some(0), Some(7)));
+    let message = cars.json().await;
+    assert_eq!((message["seq"].as_u64(), &message["tracks"]), (Some(0), &json!([])));
+    // 25 a second come, 5 go: each fifth, with the ends of those between.
+    for (seq, ended) in [(0, vec![100]), (5, (101..=105).collect()), (10, (106..=110).collect::<Vec<u64>>())]
+    {
+        let message = slow.json().await;
+        assert_eq!((message["seq"].as_u64(), &message["ended"]), (Some(seq), &json!(ended)));
+    }
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn the_same_comes_as_server_sent_events() {
+    let server = two_cameras().await;
+    let mut stream = server.open("GET", "/v1/tracks/stream?camera=yard", &[], b"").await;
+    let mut text = String::new();
+    let mut read = async |until: &str| {
+        while !text.contains(until) {
+            let mut bytes = [0; 4096];
+            let n = patiently("an event", stream.read(&mut bytes)).await.unwrap();
+            assert!(n > 0, "{text}");
+            text += std::str::from_utf8(&bytes[..n]).unwrap();
+        }
+        std::mem::take(&mut text)
+    };
+    let head = read("\r\n\r\n").await;
+    assert!(head.to_lowercase().contains("content-type: text/event-stream"), "{head}");
+    server.hub.publish(report("gate", 0));
+    server.hub.publish(report("yard", 1));
+    let event = read("\n\n").await;
+    let json = event.trim().strip_prefix("event: tracks\ndata: ").unwrap_or_else(|| panic!("{event:?}"));
+    let message: serde_json::Value = serde_json::from_str(json).unwrap();
+    assert_eq!((&message["camera"], message["seq"].as_u64()), (&"yard".into(), Some(1)));
+    let since = std::time::Instant::now();
+    server.stop().await;
+    assert!(since.elapsed() < std::time::Duration::from_secs(5), "an open stream does not hold up the end");
+}
+
+#[tokio::test]
 async fn who_may_not_or_cannot_is_told_why() {
     let server = two_cameras().await;
     let own = format!("http://{}", server.addr);
@@ -101,6 +154,11 @@ async fn who_may_not_or_cannot_is_told_why() {
         ("/v1/tracks?camera=gate&camera=nope", None, 404, "unknown-camera"),
         ("/v1/tracks?camera=", None, 400, "bad-request"),
         ("/v1/tracks?cam=gate", None, 400, "bad-request"),
+        ("/v1/tracks?class=dog", None, 400, "bad-request"),
+        ("/v1/tracks?state=gone", None, 400, "bad-request"),
+        ("/v1/tracks?min_confidence=2", None, 400, "bad-request"),
+        ("/v1/tracks?rate=0", None, 400, "bad-request"),
+        ("/v1/tracks?rate=NaN", None, 400, "bad-request"),
         ("/v1/cameras/nope/live", None, 404, "unknown-camera"),
     ] {
         let headers: Vec<_> = origin.map(|o| ("origin", o)).into_iter().collect();
