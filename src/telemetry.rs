@@ -287,6 +287,11 @@ impl Metrics {
         self.failures.with_label_values(&[id.as_str(), kind]).inc();
     }
 
+    /// A paused camera is neither up nor down.
+    pub fn pause_camera(&self, id: &CameraId) {
+        let _ = self.up.remove_label_values(&[id.as_str()]);
+    }
+
     /// Takes a removed camera's series away.
     pub fn forget_camera(&self, id: &CameraId) {
         let id = id.as_str();

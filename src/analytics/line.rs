@@ -66,6 +66,11 @@ impl LineWatch {
         self.settled.clear();
     }
 
+    /// Nobody is known any more.
+    pub fn forget_tracks(&mut self) {
+        self.settled.clear();
+    }
+
     pub fn update(
         &mut self,
         seen: &[Seen],

@@ -132,7 +132,7 @@ impl Seen {
     }
 }
 
-/// Watches one camera's tracks, from one epoch's beginning to its end.
+/// Watches one camera's tracks.
 #[derive(Debug, Default)]
 pub struct Analyst {
     rules: Rules,
@@ -173,6 +173,14 @@ impl Analyst {
             .map(|zone| kept_zone(zone, &mut zones).unwrap_or_else(|| ZoneWatch::new(zone.clone(), size)))
             .collect();
         self.rules = rules;
+    }
+
+    /// The tracks begin anew, with ids of their own; what was counted stays.
+    pub fn begin_epoch(&mut self) {
+        self.time = None;
+        self.streaks.clear();
+        self.lines.iter_mut().for_each(LineWatch::forget_tracks);
+        self.zones.iter_mut().for_each(ZoneWatch::forget_tracks);
     }
 
     /// The rules.

@@ -223,6 +223,17 @@ fn rules_change_while_they_are_watched() {
 }
 
 #[test]
+fn another_epoch_keeps_counts_and_forgets_tracks() {
+    let mut analyst = Analyst::new(Rules { lines: vec![door()], zones: vec![right()] });
+    walk(&mut analyst, &[(400.0, Confirmed, true), (600.0, Confirmed, true)]);
+    analyst.begin_epoch();
+    let counts = analyst.counts();
+    assert_eq!((counts.lines[&id("door")].inwards, counts.zones[&id("right")].occupancy), (1, 0));
+    // Another person has the same id on the other side of the line.
+    assert_eq!(walk(&mut analyst, &[(400.0, Confirmed, true), (420.0, Confirmed, true)]), []);
+}
+
+#[test]
 fn heat_is_seconds() {
     let mut analyst = Analyst::default();
     for step in 0..=10 {

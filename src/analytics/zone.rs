@@ -77,6 +77,14 @@ impl ZoneWatch {
             .collect();
     }
 
+    /// Nobody is known any more; who was in it has left, at a time that nobody knows.
+    pub fn forget_tracks(&mut self) {
+        self.count.exits += self.visits.len() as u64;
+        self.visits.clear();
+        self.count.crowded = false;
+        self.contradicted = None;
+    }
+
     pub fn update(
         &mut self,
         seen: &[Seen],

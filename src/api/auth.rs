@@ -23,10 +23,11 @@ const VIEW: Right = Right::Role(Role::Viewer);
 const CHANGE: Right = Right::Role(Role::Operator);
 
 /// What each route asks for. One that is not here asks for an admin. `HEAD` asks for what `GET` does.
-pub const RIGHTS: [(&str, &str, Right); 30] = [
+pub const RIGHTS: [(&str, &str, Right); 31] = [
     ("GET", "/v1/cameras", VIEW),
     ("POST", "/v1/cameras", CHANGE),
     ("GET", "/v1/cameras/{id}", VIEW),
+    ("PATCH", "/v1/cameras/{id}", CHANGE),
     ("DELETE", "/v1/cameras/{id}", CHANGE),
     ("GET", "/v1/cameras/{id}/snapshot.jpg", Right::Video),
     ("GET", "/v1/cameras/{id}/stream.mjpeg", Right::Video),

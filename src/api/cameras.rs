@@ -25,6 +25,10 @@ pub trait Cameras: Send + Sync + 'static {
     /// is live.
     fn add(&self, request: NewCamera) -> BoxFuture<'_, Result<CameraStatus, CameraError>>;
 
+    /// Changes a camera and remembers it. What it is now is stopped first; its counts go on, its track ids
+    /// begin anew.
+    fn patch(&self, id: &CameraId, patch: CameraPatch) -> BoxFuture<'_, Result<CameraStatus, CameraError>>;
+
     /// Stops a camera and forgets it. Returns once its threads have ended.
     fn remove(&self, id: &CameraId) -> BoxFuture<'_, Result<(), CameraError>>;
 
@@ -61,6 +65,9 @@ pub struct NewCamera {
     /// Whether a file begins again at its end.
     #[serde(rename = "loop", default)]
     pub looped: bool,
+    /// Known, but not opened.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub paused: bool,
     /// Lines to begin with; those that were changed later are remembered instead.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub lines: Vec<LineSpec>,
@@ -77,6 +84,42 @@ impl NewCamera {
     pub fn rules(&self) -> Result<Rules, RuleError> {
         RulesSpec { lines: self.lines.clone(), zones: self.zones.clone() }.rules()
     }
+}
+
+/// The body of `PATCH /v1/cameras/{id}`: what is to change. Unknown fields are refused.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CameraPatch {
+    /// Another address.
+    pub url: Option<String>,
+    /// How RTSP carries media; `null`: the source chooses.
+    #[serde(default, deserialize_with = "given")]
+    pub transport: Option<Option<Transport>>,
+    /// Whether a file begins again at its end.
+    #[serde(rename = "loop")]
+    pub looped: Option<bool>,
+    /// Whether it rests.
+    pub paused: Option<bool>,
+}
+
+impl CameraPatch {
+    /// `camera` with the changes.
+    pub fn apply(self, camera: &NewCamera) -> NewCamera {
+        NewCamera {
+            id: camera.id.clone(),
+            url: self.url.unwrap_or_else(|| camera.url.clone()),
+            transport: self.transport.unwrap_or(camera.transport),
+            looped: self.looped.unwrap_or(camera.looped),
+            paused: self.paused.unwrap_or(camera.paused),
+            lines: camera.lines.clone(),
+            zones: camera.zones.clone(),
+        }
+    }
+}
+
+/// Tells `null` from absent.
+fn given<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Option<Transport>>, D::Error> {
+    Option::deserialize(deserializer).map(Some)
 }
 
 /// How RTSP carries media.
@@ -103,6 +146,8 @@ pub enum CameraState {
     Ended,
     /// Gave up for good.
     Failed,
+    /// Stopped by request, not forgotten.
+    Paused,
 }
 
 /// Live tracks by state.

@@ -3,7 +3,7 @@
 //! ```text
 //! /                                the web page
 //! /v1/cameras                      GET list, POST add
-//! /v1/cameras/{id}                 GET status, DELETE
+//! /v1/cameras/{id}                 GET status, PATCH, DELETE
 //! /v1/cameras/{id}/snapshot.jpg    newest picture, boxes drawn in
 //! /v1/cameras/{id}/stream.mjpeg    live pictures, boxes drawn in
 //! /v1/cameras/{id}/live            WebSocket: pictures as they are, each with its tracks
@@ -46,7 +46,9 @@ use prometheus::Registry;
 use tokio_rustls::rustls::ServerConfig;
 
 pub use auth::RIGHTS;
-pub use cameras::{CameraError, CameraState, CameraStatus, Cameras, NewCamera, TrackCounts, Transport};
+pub use cameras::{
+    CameraError, CameraPatch, CameraState, CameraStatus, Cameras, NewCamera, TrackCounts, Transport,
+};
 pub use rules::{AnchorSpec, EditError, Findings, LineSpec, Rule, RuleEdit, RulesSpec, ZoneSpec};
 pub use server::{serve, serve_with};
 pub use socket::KeepAlive;
@@ -104,7 +106,7 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
     let state = ApiState { cameras, hub, events, registry, readiness, gate, secure, studio, seats, sockets };
     Router::new()
         .route("/v1/cameras", get(rest::list).post(rest::add))
-        .route("/v1/cameras/{id}", get(rest::get).delete(rest::remove))
+        .route("/v1/cameras/{id}", get(rest::get).patch(rest::patch).delete(rest::remove))
         .route("/v1/cameras/{id}/snapshot.jpg", get(live::snapshot))
         .route("/v1/cameras/{id}/stream.mjpeg", get(live::mjpeg))
         .route("/v1/cameras/{id}/live", get(live::live))

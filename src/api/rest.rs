@@ -11,7 +11,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::problem::Problem;
-use super::{ApiState, CameraStatus, MAX_BODY_BYTES, NewCamera, ssrf};
+use super::{ApiState, CameraPatch, CameraStatus, MAX_BODY_BYTES, NewCamera, ssrf};
 use crate::auth::{Identity, Role};
 use crate::types::CameraId;
 
@@ -49,6 +49,27 @@ pub(super) async fn add(
         response.headers_mut().insert(header::LOCATION, location);
     }
     Ok(response)
+}
+
+pub(super) async fn patch(
+    State(state): State<ApiState>,
+    Path(name): Path<String>,
+    Extension(identity): Extension<Option<Identity>>,
+    headers: HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Result<Json<CameraStatus>, Problem> {
+    let id = camera_id(&name)?;
+    let patch: CameraPatch = json_body(&headers, body)?;
+    if let Some(url) = &patch.url
+        && identity.is_none_or(|identity| identity.role < Role::Admin)
+    {
+        ssrf::check(url).await?;
+    }
+    match state.cameras.patch(&id, patch).await {
+        Ok(status) => Ok(Json(status)),
+        Err(super::CameraError::NotFound) => Err(Problem::unknown_camera(&name)),
+        Err(other) => Err(other.into()),
+    }
 }
 
 pub(super) async fn remove(

@@ -252,7 +252,15 @@ fn camera(text: &str, looped: bool) -> Result<NewCamera> {
         .filter(|(id, _)| !id.contains("://"))
         .context("--camera needs NAME=URL, such as gate=rtsp://10.0.0.2/stream1: the name is missing")?;
     let id = CameraId::new(id).context("--camera NAME=URL: wrong name")?;
-    Ok(NewCamera { id, url: url.into(), transport: None, looped, lines: vec![], zones: vec![] })
+    Ok(NewCamera {
+        id,
+        url: url.into(),
+        transport: None,
+        looped,
+        paused: false,
+        lines: vec![],
+        zones: vec![],
+    })
 }
 
 pub(super) fn default_state_dir() -> Option<PathBuf> {

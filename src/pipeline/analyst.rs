@@ -39,12 +39,16 @@ impl CameraAnalyst {
         for happening in &happened {
             self.measure(happening);
         }
-        for (zone, count) in analyst.counts().zones {
-            self.metrics.zone(&self.camera, &zone).occupancy.set(i64::from(count.occupancy));
-        }
+        self.show_occupancy(&analyst);
         drop(analyst);
         for happening in &happened {
             self.events.publish(report, happening);
+        }
+    }
+
+    fn show_occupancy(&self, analyst: &Analyst) {
+        for (zone, count) in analyst.counts().zones {
+            self.metrics.zone(&self.camera, &zone).occupancy.set(i64::from(count.occupancy));
         }
     }
 
@@ -60,6 +64,13 @@ impl CameraAnalyst {
             }
             What::Loitering { .. } | What::Crowded { .. } | What::Cleared { .. } => {}
         }
+    }
+
+    /// The camera's tracks begin anew.
+    pub fn begin_epoch(&self) {
+        let mut analyst = self.analyst();
+        analyst.begin_epoch();
+        self.show_occupancy(&analyst);
     }
 
     /// Watches other rules from now on; they have been checked.
@@ -81,9 +92,7 @@ impl CameraAnalyst {
             self.metrics.zone(&self.camera, zone);
         }
         analyst.set_rules(rules);
-        for (zone, count) in analyst.counts().zones {
-            self.metrics.zone(&self.camera, &zone).occupancy.set(i64::from(count.occupancy));
-        }
+        self.show_occupancy(&analyst);
     }
 
     /// What is watched.

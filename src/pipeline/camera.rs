@@ -109,6 +109,8 @@ pub enum CameraState {
     Ended,
     /// Gave up for good.
     Failed,
+    /// Nobody wants it now.
+    Paused,
 }
 
 /// What is known of a camera, shared with whoever asks.
@@ -142,6 +144,20 @@ pub struct Condition {
 }
 
 impl CameraView {
+    /// Of a camera that has just begun to be in `state`.
+    pub fn new(id: CameraId, epoch: Epoch, metrics: Arc<CameraMetrics>, state: CameraState) -> Self {
+        let condition = Condition {
+            state,
+            since: SystemTime::now(),
+            last_failure: None,
+            next_retry: None,
+            opened: None,
+            size: None,
+            fps: None,
+        };
+        Self { id, epoch, metrics, state: Mutex::new(condition) }
+    }
+
     /// Its condition now.
     pub fn condition(&self) -> Condition {
         self.state.lock().unwrap_or_else(PoisonError::into_inner).clone()
@@ -172,20 +188,8 @@ impl Camera {
         let CameraPlan { id, epoch, spec, tracker, outlet, policy } = plan;
         spec.check()?;
         let metrics = lanes.metrics.camera(&id);
-        let view = Arc::new(CameraView {
-            id: id.clone(),
-            epoch,
-            metrics: metrics.clone(),
-            state: Mutex::new(Condition {
-                state: CameraState::Connecting,
-                since: SystemTime::now(),
-                last_failure: None,
-                next_retry: None,
-                opened: None,
-                size: None,
-                fps: None,
-            }),
-        });
+        let view = CameraView::new(id.clone(), epoch, metrics.clone(), CameraState::Connecting);
+        let view = Arc::new(view);
         let seat = lanes.tracker.attach(id.clone(), epoch, tracker, outlet, metrics).await?;
         let capacity = if policy == Policy::Wait { AHEAD } else { 1 };
         let mailbox = Arc::new(Mailbox::new(capacity, policy, lanes.metrics.queue("frames")));

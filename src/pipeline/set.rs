@@ -16,8 +16,8 @@ use super::outlet::LiveOutlet;
 use super::store::{Remembered, Store};
 use crate::analytics::{Heat, Rules};
 use crate::api::{
-    self, CameraError, CameraStatus, Cameras, EditError, Findings, NewCamera, RuleEdit, RulesSpec,
-    TrackCounts,
+    self, CameraError, CameraPatch, CameraStatus, Cameras, EditError, Findings, NewCamera, RuleEdit,
+    RulesSpec, TrackCounts,
 };
 use crate::ingest::{Pacing, SourceError, SourceSpec, Transport};
 use crate::publish::{EventHub, Hub, Picture};
@@ -65,11 +65,25 @@ struct Shown {
     analyst: Arc<CameraAnalyst>,
 }
 
+/// A camera and what it was made of.
+struct Known {
+    camera: NewCamera,
+    /// `None` while it is paused.
+    running: Option<Camera>,
+}
+
 struct Changes {
-    cameras: BTreeMap<CameraId, Camera>,
+    cameras: BTreeMap<CameraId, Known>,
     store: Option<Store>,
     remembered: Remembered,
     stopping: bool,
+}
+
+impl Changes {
+    fn begin_epoch(&mut self) -> Epoch {
+        self.remembered.epoch = next_epoch(self.remembered.epoch);
+        Epoch(self.remembered.epoch)
+    }
 }
 
 impl CameraSet {
@@ -95,13 +109,22 @@ impl CameraSet {
     /// # Errors
     /// As [`Cameras::add`].
     pub async fn start_configured(&self, camera: NewCamera) -> Result<CameraStatus, CameraError> {
-        self.start(camera, false).await
+        // What was changed at run time wins.
+        let changed = self.remembered().await.into_iter().find(|c| c.id == camera.id);
+        self.start(changed.unwrap_or(camera), false).await
     }
 
-    /// Starts the cameras that are remembered. One that cannot start is told and stays remembered.
+    async fn remembered(&self) -> Vec<NewCamera> {
+        self.changes.lock().await.remembered.cameras.clone()
+    }
+
+    /// Starts the cameras that are remembered and do not run yet. One that cannot start is told and stays
+    /// remembered.
     pub async fn start_remembered(&self) {
-        let remembered = self.changes.lock().await.remembered.cameras.clone();
-        for camera in remembered {
+        for camera in self.remembered().await {
+            if self.get(&camera.id).is_some() {
+                continue;
+            }
             let id = camera.id.clone();
             if let Err(error) = self.start(camera, false).await {
                 tracing::error!(camera = %id, %error, "a remembered camera cannot start");
@@ -116,7 +139,8 @@ impl CameraSet {
             changes.stopping = true;
             std::mem::take(&mut changes.cameras)
         };
-        futures::future::join_all(cameras.into_values().map(Camera::stop)).await;
+        let running = cameras.into_values().filter_map(|known| known.running);
+        futures::future::join_all(running.map(Camera::stop)).await;
         self.shown().clear();
         // Whoever still reads the set lets the stages end when it lets go.
         if let Some(set) = Arc::into_inner(self) {
@@ -139,18 +163,12 @@ impl CameraSet {
         }
         spec.check().map_err(|e| CameraError::Invalid(e.to_string()))?;
         let before = changes.remembered.clone();
-        changes.remembered.epoch = next_epoch(before.epoch);
-        let epoch = Epoch(changes.remembered.epoch);
+        let epoch = changes.begin_epoch();
         if remember {
             changes.remembered.cameras.push(camera.clone());
         }
         // First on disk, so that what was accepted is never forgotten.
-        if let Some(store) = &changes.store
-            && let Err(error) = store.save(&changes.remembered)
-        {
-            changes.remembered = before;
-            return Err(CameraError::Io(error.to_string()));
-        }
+        self.save_or_restore(&mut changes, before)?;
         // What was changed at run time wins; it was checked when it was remembered, but by an older program perhaps.
         let changed = changes.remembered.rules.get(camera.id.as_str()).cloned();
         let rules = changed.map_or(Ok(first_rules), RulesSpec::rules).unwrap_or_else(|error| {
@@ -158,49 +176,108 @@ impl CameraSet {
             Rules::default()
         });
         let analyst = CameraAnalyst::new(camera.id.clone(), rules, self.metrics.clone(), self.events.clone());
-        let analyst = Arc::new(analyst);
-        let (video, watched) = watch::channel(None);
-        let url = spec.url.redacted().to_string();
-        let plan = CameraPlan {
-            id: camera.id.clone(),
-            epoch,
-            spec,
-            tracker: self.tracker.clone(),
-            outlet: Box::new(LiveOutlet { hub: self.hub.clone(), video, analyst: analyst.clone() }),
-            policy: Policy::NewestWins,
-        };
-        let running = match Camera::start(&self.lanes, plan).await {
-            Ok(running) => running,
+        match self.launch(&mut changes, camera.clone(), spec, epoch, Arc::new(analyst)).await {
+            Ok(status) => Ok(status),
             Err(error) => {
-                analyst.set_rules(Rules::default());
+                if let Some(shown) = self.shown().remove(&camera.id) {
+                    shown.analyst.set_rules(Rules::default());
+                }
+                changes.cameras.remove(&camera.id);
                 self.metrics.forget_camera(&camera.id);
                 if remember {
                     changes.remembered.cameras.retain(|c| c.id != camera.id);
                     self.save(&changes)?;
                 }
-                return Err(match error {
-                    StartError::Source(error) => CameraError::Invalid(error.to_string()),
-                    StartError::Tracker(error) => CameraError::Io(error.to_string()),
-                });
+                Err(error)
+            }
+        }
+    }
+
+    /// Opens a camera, unless it is paused, and shows it. One that cannot be opened is shown as paused.
+    async fn launch(
+        &self,
+        changes: &mut Changes,
+        camera: NewCamera,
+        spec: SourceSpec,
+        epoch: Epoch,
+        analyst: Arc<CameraAnalyst>,
+    ) -> Result<CameraStatus, CameraError> {
+        let id = camera.id.clone();
+        let url = spec.url.redacted().to_string();
+        let (video, watched) = watch::channel(None);
+        let started = if camera.paused {
+            Ok(None)
+        } else {
+            let plan = CameraPlan {
+                id: id.clone(),
+                epoch,
+                spec,
+                tracker: self.tracker.clone(),
+                outlet: Box::new(LiveOutlet { hub: self.hub.clone(), video, analyst: analyst.clone() }),
+                policy: Policy::NewestWins,
+            };
+            Camera::start(&self.lanes, plan).await.map(Some)
+        };
+        let view = match &started {
+            Ok(Some(running)) => running.view().clone(),
+            Ok(None) | Err(_) => {
+                let metrics = self.metrics.camera(&id);
+                Arc::new(CameraView::new(id.clone(), epoch, metrics, CameraState::Paused))
             }
         };
-        let shown = Shown { url, view: running.view().clone(), video: watched, analyst };
+        let paused = view.condition().state == CameraState::Paused;
+        let shown = Shown { url, view, video: watched, analyst };
         let status = status(&shown);
-        self.shown().insert(camera.id.clone(), shown);
-        changes.cameras.insert(camera.id, running);
-        Ok(status)
+        self.shown().insert(id.clone(), shown);
+        if paused {
+            self.metrics.pause_camera(&id);
+        }
+        let (running, failed) = match started {
+            Ok(running) => (running, None),
+            Err(StartError::Source(error)) => (None, Some(CameraError::Invalid(error.to_string()))),
+            Err(StartError::Tracker(error)) => (None, Some(CameraError::Io(error.to_string()))),
+        };
+        changes.cameras.insert(id, Known { camera, running });
+        failed.map_or(Ok(status), Err)
+    }
+
+    async fn change(&self, id: &CameraId, patch: CameraPatch) -> Result<CameraStatus, CameraError> {
+        let mut changes = self.changes.lock().await;
+        let Some(known) = changes.cameras.get(id) else { return Err(CameraError::NotFound) };
+        let camera = patch.apply(&known.camera);
+        if camera == known.camera {
+            return self.get(id).ok_or(CameraError::NotFound);
+        }
+        let spec = source_spec(&camera).map_err(|e| CameraError::Invalid(e.to_string()))?;
+        spec.check().map_err(|e| CameraError::Invalid(e.to_string()))?;
+        let Some(analyst) = self.analyst(id) else { return Err(CameraError::NotFound) };
+        let before = changes.remembered.clone();
+        let epoch = changes.begin_epoch();
+        // A camera of the configuration is remembered from now on, too: what was changed at run time wins.
+        match changes.remembered.cameras.iter_mut().find(|c| c.id == *id) {
+            Some(remembered) => *remembered = camera.clone(),
+            None => changes.remembered.cameras.push(camera.clone()),
+        }
+        self.save_or_restore(&mut changes, before)?;
+        if let Some(running) = changes.cameras.remove(id).and_then(|known| known.running) {
+            running.stop().await;
+        }
+        analyst.begin_epoch();
+        self.launch(&mut changes, camera, spec, epoch, analyst).await
     }
 
     async fn stop(&self, id: &CameraId) -> Result<(), CameraError> {
         let mut changes = self.changes.lock().await;
-        let Some(camera) = changes.cameras.remove(id) else { return Err(CameraError::NotFound) };
+        let Some(known) = changes.cameras.remove(id) else { return Err(CameraError::NotFound) };
         let shown = self.shown().remove(id);
-        let known = changes.remembered.cameras.len();
+        let cameras = changes.remembered.cameras.len();
         changes.remembered.cameras.retain(|c| c.id != *id);
         let had_rules = changes.remembered.rules.remove(id.as_str()).is_some();
-        let forgets = had_rules || changes.remembered.cameras.len() < known;
+        let forgets = had_rules || changes.remembered.cameras.len() < cameras;
         let saved = if forgets { self.save(&changes) } else { Ok(()) };
-        camera.stop().await;
+        if let Some(running) = known.running {
+            running.stop().await;
+        }
         if let Some(shown) = shown {
             shown.analyst.set_rules(Rules::default());
         }
@@ -229,6 +306,15 @@ impl CameraSet {
         self.shown().get(id).map(|shown| shown.analyst.clone())
     }
 
+    /// Writes what is to be remembered; where that fails, it is again what it was `before`.
+    fn save_or_restore(&self, changes: &mut Changes, before: Remembered) -> Result<(), CameraError> {
+        let saved = self.save(changes);
+        if saved.is_err() {
+            changes.remembered = before;
+        }
+        saved
+    }
+
     fn save(&self, changes: &Changes) -> Result<(), CameraError> {
         match &changes.store {
             Some(store) => store.save(&changes.remembered).map_err(|e| CameraError::Io(e.to_string())),
@@ -252,6 +338,11 @@ impl Cameras for CameraSet {
 
     fn add(&self, request: NewCamera) -> BoxFuture<'_, Result<CameraStatus, CameraError>> {
         self.start(request, true).boxed()
+    }
+
+    fn patch(&self, id: &CameraId, patch: CameraPatch) -> BoxFuture<'_, Result<CameraStatus, CameraError>> {
+        let id = id.clone();
+        async move { self.change(&id, patch).await }.boxed()
     }
 
     fn remove(&self, id: &CameraId) -> BoxFuture<'_, Result<(), CameraError>> {
@@ -321,6 +412,7 @@ fn status(shown: &Shown) -> CameraStatus {
             CameraState::Retrying => api::CameraState::Retrying,
             CameraState::Ended => api::CameraState::Ended,
             CameraState::Failed => api::CameraState::Failed,
+            CameraState::Paused => api::CameraState::Paused,
         },
         since: Timestamp::try_from(condition.since).unwrap_or(Timestamp::UNIX_EPOCH),
         last_error_kind: condition.last_failure.as_ref().map(|f| f.label().to_string()),

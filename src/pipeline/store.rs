@@ -120,6 +120,7 @@ mod tests {
             url: "rtsp://u:p@h/s".into(),
             transport: None,
             looped: false,
+            paused: false,
             lines: vec![],
             zones: vec![],
         };

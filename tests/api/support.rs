@@ -11,8 +11,8 @@ use futures::future::BoxFuture;
 use futures::{FutureExt, StreamExt};
 use gakp::analytics::{Analyst, Heat, Rules};
 use gakp::api::{
-    ApiConfig, CameraError, CameraState, CameraStatus, Cameras, Findings, KeepAlive, NewCamera, RuleEdit,
-    TrackCounts,
+    ApiConfig, CameraError, CameraPatch, CameraState, CameraStatus, Cameras, Findings, KeepAlive, NewCamera,
+    RuleEdit, TrackCounts,
 };
 use gakp::auth::Gate;
 use gakp::publish::{EventHub, Hub, HubConfig, Picture};
@@ -141,6 +141,18 @@ impl Cameras for FakeCameras {
             Ok(self.put(request.id.as_str(), &request.url))
         }
         .boxed()
+    }
+
+    fn patch(&self, id: &CameraId, patch: CameraPatch) -> BoxFuture<'_, Result<CameraStatus, CameraError>> {
+        let mut cameras = self.cameras.lock().unwrap();
+        let patched = cameras.get_mut(id).map(|(status, _)| {
+            status.url = patch.url.unwrap_or(status.url.clone());
+            if let Some(paused) = patch.paused {
+                status.state = if paused { CameraState::Paused } else { CameraState::Live };
+            }
+            status.clone()
+        });
+        async move { patched.ok_or(CameraError::NotFound) }.boxed()
     }
 
     fn remove(&self, id: &CameraId) -> BoxFuture<'_, Result<(), CameraError>> {

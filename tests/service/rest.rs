@@ -108,3 +108,57 @@ fn cameras_are_remembered_and_forgotten_and_passwords_kept() {
     said += &service.stop();
     assert!(!said.contains("p4ss-Wort"), "a password in: {said}");
 }
+
+#[test]
+fn a_camera_is_paused_changed_and_resumed() {
+    let (Some(_), Some(film)) = (models(), film()) else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let state = folder.path().join("state");
+    let camera = format!("demo={}", film.display());
+    let args = ["--camera", camera.as_str(), "--loop"];
+    let service = Service::start(&state, &args);
+    let patch = |service: &Service, body: &str| service.request("PATCH", "/v1/cameras/demo", Some(body));
+    let all = json!({"id": "all", "points": [[0, 0], [1, 0], [1, 1], [0, 1]]});
+    assert_eq!(service.post("/v1/cameras/demo/zones", &all).status, 201);
+    let entries = |service: &Service| {
+        service.get("/v1/cameras/demo/counts").json()["zones"]["all"]["entries"].as_u64().unwrap()
+    };
+    eventually("somebody in the zone", || (entries(&service) > 0).then_some(()));
+    let before = service.camera("demo");
+
+    let paused = patch(&service, r#"{"paused": true}"#);
+    assert_eq!((paused.status, paused.json()["state"].as_str()), (200, Some("paused")), "{paused:?}");
+    let counted = entries(&service);
+    assert!(counted > 0, "what was counted stays");
+    assert_eq!(service.get("/v1/cameras/demo/counts").json()["zones"]["all"]["occupancy"], 0);
+    assert!(!service.get("/metrics").body.contains("gakp_camera_up{"), "neither up nor down");
+    let tracked = service.camera("demo")["tracked"].as_u64().unwrap();
+    std::thread::sleep(std::time::Duration::from_millis(300));
+    assert_eq!(service.camera("demo")["tracked"].as_u64().unwrap(), tracked, "it rests");
+    for (body, status) in [
+        (r#"{"url": "ftp://x"}"#, 400),
+        (r#"{"url": "/nowhere.mp4"}"#, 400),
+        (r#"{"pause": true}"#, 400),
+        ("{", 400),
+    ] {
+        assert_eq!(patch(&service, body).status, status, "{body}");
+    }
+    assert_eq!(service.camera("demo")["state"], "paused", "what is refused changes nothing");
+    service.stop();
+
+    // It is the command line's camera, and stays paused all the same.
+    let service = Service::start(&state, &args);
+    assert_eq!(service.camera("demo")["state"], "paused");
+    let resumed = patch(&service, r#"{"paused": false}"#);
+    assert_eq!(resumed.status, 200, "{resumed:?}");
+    service.wait_for_frames("demo", 3);
+    let after = service.camera("demo");
+    assert!(after["epoch"].as_u64() > before["epoch"].as_u64(), "{after}");
+    assert_eq!(service.metrics().of("gakp_camera_up", "demo"), 1.0);
+    let other = patch(&service, r#"{"url": "test:?fps=5", "loop": false}"#);
+    assert_eq!((other.status, other.json()["url"].as_str()), (200, Some("test:?fps=5")), "{other:?}");
+    service.wait_for_state("demo", "live");
+    assert_eq!(service.delete("/v1/cameras/demo").status, 204);
+    assert_eq!(patch(&service, "{}").status, 404);
+    service.stop();
+}

@@ -5,7 +5,7 @@ import { View } from "./view.js";
 
 const POLL_MS = 2000;
 const WORDS = {
-  connecting: "connecting", live: "live", retrying: "retrying", ended: "ended", failed: "failed",
+  connecting: "connecting", live: "live", retrying: "retrying", ended: "ended", failed: "failed", paused: "paused",
 };
 
 const $ = (selector) => document.querySelector(selector);
