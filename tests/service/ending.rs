@@ -55,7 +55,7 @@ fn a_second_sigterm_ends_at_once() {
     let mut service = Service::start(state.path(), &["--camera", "generated=test:?fps=5"]);
     // A request that never arrives in full is what draining waits for.
     let mut request = TcpStream::connect(service.address).unwrap();
-    let head = "POST /v1/cameras HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n{";
+    let head = "POST /v1/cameras HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n{";
     request.write_all(head.as_bytes()).unwrap();
     service.wait_for_frames("generated", 1);
 
