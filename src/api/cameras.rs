@@ -8,6 +8,7 @@ use jiff::Timestamp;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use tokio::sync::watch;
 
+use super::object::objects;
 use super::rules::{EditError, Findings, LineSpec, RuleEdit, RulesSpec, ZoneSpec};
 use crate::analytics::{Heat, RuleError, Rules};
 use crate::publish::Picture;
@@ -69,10 +70,10 @@ pub struct NewCamera {
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub paused: bool,
     /// Lines to begin with; those that were changed later are remembered instead.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[serde(default, deserialize_with = "objects", skip_serializing_if = "Vec::is_empty")]
     pub lines: Vec<LineSpec>,
     /// Zones to begin with, likewise.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[serde(default, deserialize_with = "objects", skip_serializing_if = "Vec::is_empty")]
     pub zones: Vec<ZoneSpec>,
 }
 

@@ -14,6 +14,7 @@
 //! /v1/tracks                       WebSocket: tracks as JSON or protobuf
 //! /v1/tracks/stream                the same as Server-Sent Events
 //! /v1/events[/live]                what happened at lines and in zones; a WebSocket of it
+//! /v1/openapi.json                all of this for programs
 //! /metrics /healthz /readyz
 //! ```
 //!
@@ -26,6 +27,8 @@ mod cameras;
 mod drip;
 mod events;
 mod live;
+mod object;
+mod openapi;
 mod page;
 mod problem;
 mod rest;
@@ -126,6 +129,7 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
         .route("/v1/tracks/stream", get(tracks::stream))
         .route("/v1/events", get(events::recent))
         .route("/v1/events/live", get(events::live))
+        .route("/v1/openapi.json", get(openapi::document))
         .route("/metrics", get(rest::metrics))
         .route("/healthz", get(rest::healthz))
         .route("/readyz", get(rest::readyz))

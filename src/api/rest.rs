@@ -2,7 +2,8 @@
 
 use axum::body::Bytes;
 use axum::extract::rejection::BytesRejection;
-use axum::extract::{Path, State};
+use axum::extract::{FromRequestParts, State};
+use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
@@ -10,10 +11,25 @@ use prometheus::{Encoder, TextEncoder};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
+use super::object::Object;
 use super::problem::Problem;
 use super::{ApiState, CameraPatch, CameraStatus, MAX_BODY_BYTES, NewCamera, ssrf};
 use crate::auth::{Identity, Role};
 use crate::types::CameraId;
+
+/// What the path names. Unlike axum's own it answers a path that is no UTF-8 with a problem document.
+pub(super) struct Path<T>(pub T);
+
+impl<T: DeserializeOwned + Send, S: Send + Sync> FromRequestParts<S> for Path<T> {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Problem> {
+        match axum::extract::Path::from_request_parts(parts, state).await {
+            Ok(axum::extract::Path(names)) => Ok(Self(names)),
+            Err(rejection) => Err(Problem::bad_request(rejection.body_text())),
+        }
+    }
+}
 
 #[derive(Serialize)]
 pub(super) struct CameraList {
@@ -106,6 +122,7 @@ pub(super) fn json_body<T: DeserializeOwned>(
         _ => Problem::bad_request(format!("the body did not arrive: {}", rejection.body_text())),
     })?;
     serde_json::from_slice(&body)
+        .map(|Object(value)| value)
         .map_err(|error| Problem::bad_request(format!("the body is not valid: {error}")))
 }
 

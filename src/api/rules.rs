@@ -1,7 +1,8 @@
 //! Lines and zones on the wire, and how they are changed.
 
 use jiff::Timestamp;
-use serde::{Deserialize, Serialize};
+use serde::de::{Error, Unexpected};
+use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::analytics::{Anchor, Counts, Line, Point, RuleError, RuleId, Rules, Zone};
 
@@ -33,8 +34,18 @@ pub struct ZoneSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub loiter_s: Option<f64>,
     /// More than so many are a crowd.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default, deserialize_with = "whole", skip_serializing_if = "Option::is_none")]
     pub capacity: Option<u32>,
+}
+
+/// A whole number however it is written: to JSON `8.0` is 8, and some clients know no other numbers.
+fn whole<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<u32>, D::Error> {
+    let Some(number) = Option::<f64>::deserialize(deserializer)? else { return Ok(None) };
+    let whole = number.fract() == 0.0 && (0.0..=f64::from(u32::MAX)).contains(&number);
+    let expected = "a whole number from 0 to 4294967295";
+    whole
+        .then_some(Some(number as u32))
+        .ok_or_else(|| D::Error::invalid_value(Unexpected::Float(number), &expected))
 }
 
 /// What of a box is held against lines and zones.

@@ -82,6 +82,10 @@ impl SourceSpec {
             if meta.is_dir() {
                 return Err(file(std::io::Error::other("it is a directory, not a video")));
             }
+            // Opening a pipe waits for whoever writes into it, perhaps for ever.
+            if !meta.is_file() {
+                return Err(file(std::io::Error::other("it is no regular file")));
+            }
             std::fs::File::open(path).map_err(file)?;
         }
         if self.silence < Duration::from_millis(100) {
@@ -137,4 +141,19 @@ pub enum SourceError {
     /// The system gave no thread.
     #[error("cannot start a camera thread: {0}")]
     Thread(std::io::Error),
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_no_regular_file_is_refused_unopened() {
+        for (path, expected) in
+            [("/dev/null", "no regular file"), ("/tmp", "a directory"), ("/nowhere", "No such file")]
+        {
+            let error = SourceSpec::parse(path).unwrap().check().unwrap_err().to_string();
+            assert!(error.contains(expected), "{path}: {error}");
+        }
+    }
 }
