@@ -16,6 +16,8 @@ run() {
 }
 
 bash deploy/setup.sh rust packages test-packages models footage
+# Nothing here is built twice, so what a second build would want is not kept.
+export CARGO_INCREMENTAL=0
 run cargo fmt --check
 run cargo clippy --locked --all-targets --features learn -- -D warnings
 run cargo test --locked --features learn
