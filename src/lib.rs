@@ -34,6 +34,8 @@ pub mod config;
 #[cfg(feature = "service")]
 pub mod pipeline;
 #[cfg(feature = "service")]
+mod private;
+#[cfg(feature = "service")]
 pub mod telemetry;
 #[cfg(any(feature = "cli", feature = "infer", feature = "service"))]
 pub mod tuning;

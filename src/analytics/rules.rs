@@ -4,6 +4,7 @@ use std::fmt;
 use std::sync::Arc;
 
 use super::geometry::{Point, area};
+use crate::types::is_name;
 
 /// Lines, and likewise zones, that one camera takes.
 pub const MAX_RULES: usize = 32;
@@ -24,10 +25,11 @@ impl RuleId {
     /// # Errors
     /// [`RuleError::Name`].
     pub fn new(name: &str) -> Result<Self, RuleError> {
-        let ok = (1..=64).contains(&name.len())
-            && name.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
-            && name.as_bytes()[0].is_ascii_alphanumeric();
-        if ok { Ok(Self(name.into())) } else { Err(RuleError::Name(name.chars().take(80).collect())) }
+        if is_name(name) {
+            Ok(Self(name.into()))
+        } else {
+            Err(RuleError::Name(name.chars().take(80).collect()))
+        }
     }
 
     /// The name.

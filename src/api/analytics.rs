@@ -3,167 +3,96 @@
 use std::collections::BTreeMap;
 
 use axum::Json;
-use axum::body::Bytes;
 use axum::extract::State;
-use axum::extract::rejection::BytesRejection;
-use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
-use axum::response::{IntoResponse, Response};
+use axum::http::StatusCode;
+use axum::response::Response;
+use axum::routing::{MethodRouter, get};
 use jiff::Timestamp;
 use serde::Serialize;
 
 use super::ApiState;
+use super::extract::{JsonBody, Path, camera_id};
 use super::problem::Problem;
-use super::rest::{Path, camera_id, json_body};
-use super::rules::{EditError, Findings, LineSpec, Rule, RuleEdit, RulesSpec, ZoneSpec};
-use crate::analytics::{
-    HEAT_COLUMNS, HEAT_ROWS, Heat, Line, LineCount, RuleError, RuleId, Rules, Zone, ZoneCount,
-};
+use super::rest::created;
+use super::rules::{Drawn, EditError, Findings, RuleEdit, RulesSpec};
+use crate::analytics::{HEAT_COLUMNS, HEAT_ROWS, Heat, LineCount, RuleError, RuleId, ZoneCount};
 
-#[derive(Serialize)]
-pub(super) struct LineList {
-    lines: Vec<LineSpec>,
+/// `GET` and `POST` of a camera's lines or zones.
+pub(super) fn all_of<T: Drawn>() -> MethodRouter<ApiState> {
+    get(list::<T>).post(add::<T>)
 }
 
-#[derive(Serialize)]
-pub(super) struct ZoneList {
-    zones: Vec<ZoneSpec>,
+/// `GET`, `PUT` and `DELETE` of a line or a zone.
+pub(super) fn one_of<T: Drawn>() -> MethodRouter<ApiState> {
+    get(one::<T>).put(put::<T>).delete(remove::<T>)
 }
 
-fn rules(state: &ApiState, camera: &str) -> Result<Rules, Problem> {
-    state.cameras.rules(&camera_id(camera)?).ok_or_else(|| Problem::unknown_camera(camera))
+fn rules(state: &ApiState, camera: &str) -> Result<RulesSpec, Problem> {
+    let rules = state.cameras.rules(&camera_id(camera)?);
+    rules.map(|rules| RulesSpec::from(&rules)).ok_or_else(|| Problem::unknown_camera(camera))
 }
 
-async fn edit(state: &ApiState, camera: &str, change: RuleEdit) -> Result<Rules, Problem> {
-    Ok(state.cameras.edit_rules(&camera_id(camera)?, change).await?)
+async fn edit(state: &ApiState, camera: &str, change: RuleEdit) -> Result<(), Problem> {
+    state.cameras.edit_rules(&camera_id(camera)?, change).await?;
+    Ok(())
 }
 
 /// A name from a path: one that is no name names nothing.
-fn rule_id(name: &str, what: &'static str) -> Result<RuleId, Problem> {
+fn rule_id<T: Drawn>(name: &str) -> Result<RuleId, Problem> {
     RuleId::new(name)
-        .map_err(|_| Problem::unknown_rule(format!("there is no {what} {name:?} on this camera")))
+        .map_err(|_| Problem::unknown_rule(format!("there is no {} {name:?} on this camera", T::WHAT)))
 }
 
-fn created(camera: &str, what: &str, id: &str, body: impl Serialize) -> Response {
-    let mut response = (StatusCode::CREATED, Json(body)).into_response();
-    if let Ok(location) = HeaderValue::from_str(&format!("/v1/cameras/{camera}/{what}/{id}")) {
-        response.headers_mut().insert(header::LOCATION, location);
-    }
-    response
+async fn list<T: Drawn>(
+    State(state): State<ApiState>,
+    Path(camera): Path<String>,
+) -> Result<Json<BTreeMap<&'static str, Vec<T>>>, Problem> {
+    Ok(Json(BTreeMap::from([(T::PLURAL, T::of(rules(&state, &camera)?))])))
 }
 
-/// The body of a `PUT`; a name in it must be that of the path.
-fn named<T: serde::de::DeserializeOwned>(
-    headers: &HeaderMap,
-    body: Result<Bytes, BytesRejection>,
-    id: &str,
-    of: fn(&T) -> &str,
-) -> Result<T, Problem> {
-    let spec: T = json_body(headers, body)?;
-    if of(&spec) != id {
-        let got = of(&spec);
-        return Err(Problem::bad_request(format!("the body is of {got:?}, the path of {id:?}")));
+async fn one<T: Drawn>(
+    State(state): State<ApiState>,
+    Path((camera, id)): Path<(String, String)>,
+) -> Result<Json<T>, Problem> {
+    let (all, id) = (T::of(rules(&state, &camera)?), rule_id::<T>(&id)?);
+    let found = all.into_iter().find(|spec| spec.name() == id.as_str());
+    found.map(Json).ok_or_else(|| EditError::Unknown { what: T::WHAT, id }.into())
+}
+
+async fn add<T: Drawn>(
+    State(state): State<ApiState>,
+    Path(camera): Path<String>,
+    JsonBody(spec): JsonBody<T>,
+) -> Result<Response, Problem> {
+    let rule = spec.clone().rule().map_err(refused)?;
+    edit(&state, &camera, RuleEdit::Add(rule)).await?;
+    Ok(created(format!("/v1/cameras/{camera}/{}/{}", T::PLURAL, spec.name()), spec))
+}
+
+/// The name in the body must be that of the path.
+async fn put<T: Drawn>(
+    State(state): State<ApiState>,
+    Path((camera, id)): Path<(String, String)>,
+    JsonBody(spec): JsonBody<T>,
+) -> Result<Json<T>, Problem> {
+    if spec.name() != id {
+        return Err(Problem::bad_request(format!("the body is of {:?}, the path of {id:?}", spec.name())));
     }
-    Ok(spec)
+    let rule = spec.clone().rule().map_err(refused)?;
+    edit(&state, &camera, RuleEdit::Put(rule)).await?;
+    Ok(Json(spec))
+}
+
+async fn remove<T: Drawn>(
+    State(state): State<ApiState>,
+    Path((camera, id)): Path<(String, String)>,
+) -> Result<StatusCode, Problem> {
+    edit(&state, &camera, T::removal(rule_id::<T>(&id)?)).await?;
+    Ok(StatusCode::NO_CONTENT)
 }
 
 fn refused(error: RuleError) -> Problem {
     Problem::bad_request(error.to_string())
-}
-
-pub(super) async fn lines(
-    State(state): State<ApiState>,
-    Path(camera): Path<String>,
-) -> Result<Json<LineList>, Problem> {
-    Ok(Json(LineList { lines: RulesSpec::from(&rules(&state, &camera)?).lines }))
-}
-
-pub(super) async fn line(
-    State(state): State<ApiState>,
-    Path((camera, id)): Path<(String, String)>,
-) -> Result<Json<LineSpec>, Problem> {
-    let (rules, id) = (rules(&state, &camera)?, rule_id(&id, "line")?);
-    let line = rules.lines.iter().find(|line| line.id == id);
-    line.map(|line| Json(line.into())).ok_or_else(|| EditError::Unknown { what: "line", id }.into())
-}
-
-pub(super) async fn add_line(
-    State(state): State<ApiState>,
-    Path(camera): Path<String>,
-    headers: HeaderMap,
-    body: Result<Bytes, BytesRejection>,
-) -> Result<Response, Problem> {
-    let spec: LineSpec = json_body(&headers, body)?;
-    let line = Line::try_from(spec.clone()).map_err(refused)?;
-    edit(&state, &camera, RuleEdit::Add(Rule::Line(line))).await?;
-    Ok(created(&camera, "lines", &spec.id.clone(), spec))
-}
-
-pub(super) async fn put_line(
-    State(state): State<ApiState>,
-    Path((camera, id)): Path<(String, String)>,
-    headers: HeaderMap,
-    body: Result<Bytes, BytesRejection>,
-) -> Result<Json<LineSpec>, Problem> {
-    let spec = named(&headers, body, &id, |spec: &LineSpec| &spec.id)?;
-    let line = Line::try_from(spec.clone()).map_err(refused)?;
-    edit(&state, &camera, RuleEdit::Put(Rule::Line(line))).await?;
-    Ok(Json(spec))
-}
-
-pub(super) async fn remove_line(
-    State(state): State<ApiState>,
-    Path((camera, id)): Path<(String, String)>,
-) -> Result<StatusCode, Problem> {
-    edit(&state, &camera, RuleEdit::RemoveLine(rule_id(&id, "line")?)).await?;
-    Ok(StatusCode::NO_CONTENT)
-}
-
-pub(super) async fn zones(
-    State(state): State<ApiState>,
-    Path(camera): Path<String>,
-) -> Result<Json<ZoneList>, Problem> {
-    Ok(Json(ZoneList { zones: RulesSpec::from(&rules(&state, &camera)?).zones }))
-}
-
-pub(super) async fn zone(
-    State(state): State<ApiState>,
-    Path((camera, id)): Path<(String, String)>,
-) -> Result<Json<ZoneSpec>, Problem> {
-    let (rules, id) = (rules(&state, &camera)?, rule_id(&id, "zone")?);
-    let zone = rules.zones.iter().find(|zone| zone.id == id);
-    zone.map(|zone| Json(zone.into())).ok_or_else(|| EditError::Unknown { what: "zone", id }.into())
-}
-
-pub(super) async fn add_zone(
-    State(state): State<ApiState>,
-    Path(camera): Path<String>,
-    headers: HeaderMap,
-    body: Result<Bytes, BytesRejection>,
-) -> Result<Response, Problem> {
-    let spec: ZoneSpec = json_body(&headers, body)?;
-    let zone = Zone::try_from(spec.clone()).map_err(refused)?;
-    edit(&state, &camera, RuleEdit::Add(Rule::Zone(zone))).await?;
-    Ok(created(&camera, "zones", &spec.id.clone(), spec))
-}
-
-pub(super) async fn put_zone(
-    State(state): State<ApiState>,
-    Path((camera, id)): Path<(String, String)>,
-    headers: HeaderMap,
-    body: Result<Bytes, BytesRejection>,
-) -> Result<Json<ZoneSpec>, Problem> {
-    let spec = named(&headers, body, &id, |spec: &ZoneSpec| &spec.id)?;
-    let zone = Zone::try_from(spec.clone()).map_err(refused)?;
-    edit(&state, &camera, RuleEdit::Put(Rule::Zone(zone))).await?;
-    Ok(Json(spec))
-}
-
-pub(super) async fn remove_zone(
-    State(state): State<ApiState>,
-    Path((camera, id)): Path<(String, String)>,
-) -> Result<StatusCode, Problem> {
-    edit(&state, &camera, RuleEdit::RemoveZone(rule_id(&id, "zone")?)).await?;
-    Ok(StatusCode::NO_CONTENT)
 }
 
 #[derive(Serialize)]

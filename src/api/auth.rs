@@ -7,12 +7,9 @@ use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
 use serde::{Deserialize, Serialize};
 
-use axum::body::Bytes;
-use axum::extract::rejection::BytesRejection;
-
 use super::ApiState;
+use super::extract::JsonBody;
 use super::problem::Problem;
-use super::rest::json_body;
 use super::socket::same_origin;
 use crate::auth::{Gate, Identity, Right, Role, SESSION_LIFE};
 
@@ -184,7 +181,7 @@ pub(super) async fn session(
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct SignIn {
+pub(super) struct SignIn {
     token: String,
 }
 
@@ -192,12 +189,11 @@ struct SignIn {
 pub(super) async fn sign_in(
     State(state): State<ApiState>,
     headers: HeaderMap,
-    body: Result<Bytes, BytesRejection>,
+    JsonBody(SignIn { token }): JsonBody<SignIn>,
 ) -> Result<Response, Problem> {
     if !same_origin(&headers) {
         return Err(Problem::forbidden_origin("sign in from a page of this service"));
     }
-    let SignIn { token } = json_body(&headers, body)?;
     let Some((session, identity)) = state.gate.sign_in(token.trim()) else {
         return Err(Problem::unauthenticated("the token is not known; `gakp token create` makes one"));
     };

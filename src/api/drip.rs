@@ -4,11 +4,10 @@ use std::convert::Infallible;
 
 use axum::body::{Body, Bytes};
 use futures::stream::unfold;
-use tokio::sync::{OwnedSemaphorePermit, mpsc};
+use tokio::sync::mpsc;
 use tokio::time::timeout;
 
-use super::server::Stop;
-use super::socket::{Pass, SEND_TIMEOUT};
+use super::socket::{SEND_TIMEOUT, Ticket};
 
 /// What comes next.
 pub(super) trait Parts: Send + 'static {
@@ -18,28 +17,25 @@ pub(super) trait Parts: Send + 'static {
 
 /// A body of `parts`. It ends with them, with the client, with its token or with the service; a client that takes
 /// nothing for [`SEND_TIMEOUT`] is let go.
-pub(super) fn body(parts: impl Parts, stop: Stop, pass: Pass, seat: OwnedSemaphorePermit) -> Body {
+pub(super) fn body(parts: impl Parts, ticket: Ticket) -> Body {
     // One part at most waits for the connection, so what is sent is new.
     let (sender, receiver) = mpsc::channel::<Bytes>(1);
-    tokio::spawn(async move {
-        let _seat = seat;
-        feed(parts, sender, stop, pass).await;
-    });
+    tokio::spawn(feed(parts, sender, ticket));
     Body::from_stream(unfold(receiver, async |mut receiver| {
         Some((Ok::<_, Infallible>(receiver.recv().await?), receiver))
     }))
 }
 
-async fn feed(mut parts: impl Parts, sender: mpsc::Sender<Bytes>, mut stop: Stop, pass: Pass) {
-    while pass.is_valid() {
+async fn feed(mut parts: impl Parts, sender: mpsc::Sender<Bytes>, mut ticket: Ticket) {
+    while ticket.pass.is_valid() {
         // Room first, then the part: it is the newest at the moment when it can go.
         let room = tokio::select! {
-            () = stop.stopped() => return,
+            () = ticket.stop.stopped() => return,
             room = timeout(SEND_TIMEOUT, sender.reserve()) => room,
         };
         let Ok(Ok(room)) = room else { return };
         let part = tokio::select! {
-            () = stop.stopped() => return,
+            () = ticket.stop.stopped() => return,
             () = sender.closed() => return,
             part = parts.next() => part,
         };

@@ -1,19 +1,16 @@
 //! `/v1/events`: what happened lately; `/v1/events/live`: a WebSocket of what happens.
 
-use axum::Extension;
 use axum::body::Bytes;
-use axum::extract::ws::rejection::WebSocketUpgradeRejection;
-use axum::extract::ws::{Message, Utf8Bytes, WebSocketUpgrade, close_code};
+use axum::extract::ws::{Message, Utf8Bytes, close_code};
 use axum::extract::{Query, State};
-use axum::http::{HeaderMap, header};
+use axum::http::header;
 use axum::response::{IntoResponse, Response};
 
 use super::ApiState;
+use super::extract::known_camera;
 use super::problem::Problem;
-use super::socket::{self, Outgoing, Pass};
-use crate::auth::Identity;
+use super::socket::{Opening, Outgoing};
 use crate::publish::{EVENT_KINDS, EventFilter, EventListener, Heard};
-use crate::types::CameraId;
 
 /// Events in an answer if the client does not say.
 const DEFAULT_LIMIT: usize = 100;
@@ -53,19 +50,10 @@ pub(super) async fn recent(
 pub(super) async fn live(
     State(state): State<ApiState>,
     Query(query): Query<Vec<(String, String)>>,
-    Extension(identity): Extension<Option<Identity>>,
-    headers: HeaderMap,
-    upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
+    opening: Opening,
 ) -> Result<Response, Problem> {
-    let upgrade = socket::upgrade(&headers, upgrade)?;
     let filter = filter(&state, &query, "`camera` and `type`")?;
-    let seat = state.seats.take()?;
-    let (sockets, pass) = (state.sockets.clone(), Pass::new(&state.gate, identity));
-    let stream = EventStream(state.events.listen(filter));
-    Ok(upgrade.on_upgrade(|socket| async move {
-        let _seat = seat;
-        socket::run(socket, sockets, pass, stream).await;
-    }))
+    Ok(opening.run(EventStream(state.events.listen(filter))))
 }
 
 fn filter(state: &ApiState, query: &[(String, String)], known: &str) -> Result<EventFilter, Problem> {
@@ -73,11 +61,7 @@ fn filter(state: &ApiState, query: &[(String, String)], known: &str) -> Result<E
     for (key, value) in query {
         match key.as_str() {
             "camera" => {
-                let id = CameraId::new(value)?;
-                if state.cameras.get(&id).is_none() {
-                    return Err(Problem::unknown_camera(value));
-                }
-                filter.cameras.insert(id);
+                filter.cameras.insert(known_camera(state, value)?);
             }
             "type" => {
                 let kind = EVENT_KINDS.into_iter().find(|kind| kind == value).ok_or_else(|| {

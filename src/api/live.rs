@@ -2,23 +2,22 @@
 
 use std::sync::Arc;
 
-use axum::Extension;
 use axum::body::Bytes;
-use axum::extract::ws::rejection::WebSocketUpgradeRejection;
-use axum::extract::ws::{Message, WebSocketUpgrade, close_code};
+use axum::extract::ws::{Message, close_code};
 use axum::extract::{Query, State};
-use axum::http::{HeaderMap, header};
+use axum::http::header;
 use axum::response::{IntoResponse, Response};
-use tokio::sync::watch;
+use tokio::sync::watch::Receiver;
 
 use super::ApiState;
 use super::drip::{self, Parts};
+use super::extract::{Path, camera_id};
 use super::problem::Problem;
-use super::rest::{Path, camera_id};
-use super::socket::{self, Outgoing, Pass};
+use super::socket::{Opening, Outgoing, Ticket};
 use super::video::{Shot, View};
-use crate::auth::Identity;
 use crate::publish::encode_json;
+
+type Shots = Receiver<Option<Arc<Shot>>>;
 
 /// `GET /v1/cameras/{id}/snapshot.jpg`: the newest tracked picture; `?annotate=false` without boxes.
 pub(super) async fn snapshot(
@@ -61,24 +60,18 @@ pub(super) async fn mjpeg(
     State(state): State<ApiState>,
     Path(name): Path<String>,
     Query(query): Query<Vec<(String, String)>>,
-    Extension(identity): Extension<Option<Identity>>,
+    ticket: Ticket,
 ) -> Result<Response, Problem> {
-    let view = view(&query)?;
-    let shots = state
-        .studio
-        .watch(&*state.cameras, &camera_id(&name)?, view)
-        .ok_or_else(|| Problem::unknown_camera(&name))?;
-    let seat = state.seats.take()?;
-    let (stop, pass) = (state.sockets.stop.clone(), Pass::new(&state.gate, identity));
+    let shots = watch(&state, &name, view(&query)?)?;
     let headers = [
         (header::CONTENT_TYPE, format!("multipart/x-mixed-replace; boundary={BOUNDARY}")),
         (header::CACHE_CONTROL, "no-store".to_owned()),
     ];
-    Ok((headers, drip::body(Film(shots), stop, pass, seat)).into_response())
+    Ok((headers, drip::body(Film(shots), ticket)).into_response())
 }
 
 /// The parts of an MJPEG stream.
-struct Film(watch::Receiver<Option<Arc<Shot>>>);
+struct Film(Shots);
 
 impl Parts for Film {
     async fn next(&mut self) -> Option<Bytes> {
@@ -97,7 +90,7 @@ fn part(shot: &Shot) -> Bytes {
 }
 
 /// The next picture that was not seen yet; `None` when the camera is gone. Cancel safe.
-async fn newest(shots: &mut watch::Receiver<Option<Arc<Shot>>>) -> Option<Arc<Shot>> {
+async fn newest(shots: &mut Shots) -> Option<Arc<Shot>> {
     loop {
         shots.changed().await.ok()?;
         if let Some(shot) = shots.borrow_and_update().clone() {
@@ -112,27 +105,19 @@ async fn newest(shots: &mut watch::Receiver<Option<Arc<Shot>>>) -> Option<Arc<Sh
 pub(super) async fn live(
     State(state): State<ApiState>,
     Path(name): Path<String>,
-    Extension(identity): Extension<Option<Identity>>,
-    headers: HeaderMap,
-    upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
+    opening: Opening,
 ) -> Result<Response, Problem> {
-    let id = camera_id(&name)?;
-    let upgrade = socket::upgrade(&headers, upgrade)?;
-    let shots = state
-        .studio
-        .watch(&*state.cameras, &id, View::Plain)
-        .ok_or_else(|| Problem::unknown_camera(&name))?;
-    let seat = state.seats.take()?;
-    let (sockets, pass) = (state.sockets.clone(), Pass::new(&state.gate, identity));
-    let stream = PictureStream { shots, classes: state.hub.classes().clone() };
-    Ok(upgrade.on_upgrade(|socket| async move {
-        let _seat = seat;
-        socket::run(socket, sockets, pass, stream).await;
-    }))
+    let shots = watch(&state, &name, View::Plain)?;
+    Ok(opening.run(PictureStream { shots, classes: state.hub.classes().clone() }))
+}
+
+fn watch(state: &ApiState, name: &str, view: View) -> Result<Shots, Problem> {
+    let shots = state.studio.watch(&*state.cameras, &camera_id(name)?, view);
+    shots.ok_or_else(|| Problem::unknown_camera(name))
 }
 
 struct PictureStream {
-    shots: watch::Receiver<Option<Arc<Shot>>>,
+    shots: Shots,
     classes: Arc<[String]>,
 }
 

@@ -26,6 +26,7 @@ mod auth;
 mod cameras;
 mod drip;
 mod events;
+mod extract;
 mod live;
 mod object;
 mod openapi;
@@ -113,16 +114,10 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
         .route("/v1/cameras/{id}/snapshot.jpg", get(live::snapshot))
         .route("/v1/cameras/{id}/stream.mjpeg", get(live::mjpeg))
         .route("/v1/cameras/{id}/live", get(live::live))
-        .route("/v1/cameras/{id}/lines", get(analytics::lines).post(analytics::add_line))
-        .route(
-            "/v1/cameras/{id}/lines/{line}",
-            get(analytics::line).put(analytics::put_line).delete(analytics::remove_line),
-        )
-        .route("/v1/cameras/{id}/zones", get(analytics::zones).post(analytics::add_zone))
-        .route(
-            "/v1/cameras/{id}/zones/{zone}",
-            get(analytics::zone).put(analytics::put_zone).delete(analytics::remove_zone),
-        )
+        .route("/v1/cameras/{id}/lines", analytics::all_of::<LineSpec>())
+        .route("/v1/cameras/{id}/lines/{line}", analytics::one_of::<LineSpec>())
+        .route("/v1/cameras/{id}/zones", analytics::all_of::<ZoneSpec>())
+        .route("/v1/cameras/{id}/zones/{zone}", analytics::one_of::<ZoneSpec>())
         .route("/v1/cameras/{id}/counts", get(analytics::counts))
         .route("/v1/cameras/{id}/heatmap", get(analytics::heat_map))
         .route("/v1/tracks", get(tracks::tracks))

@@ -1,7 +1,7 @@
 //! Lines and zones on the wire, and how they are changed.
 
 use jiff::Timestamp;
-use serde::de::{Error, Unexpected};
+use serde::de::{DeserializeOwned, Error, Unexpected};
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::analytics::{Anchor, Counts, Line, Point, RuleError, RuleId, Rules, Zone};
@@ -170,6 +170,60 @@ fn remove<T: Named>(all: &mut Vec<T>, id: RuleId) -> Result<(), EditError> {
     let before = all.len();
     all.retain(|rule| *rule.id() != id);
     if all.len() < before { Ok(()) } else { Err(EditError::Unknown { what: T::WHAT, id }) }
+}
+
+/// What lines and zones have in common on the wire.
+pub(super) trait Drawn: Clone + Serialize + DeserializeOwned + Send + Sync + 'static {
+    const WHAT: &'static str;
+    /// As the paths have it.
+    const PLURAL: &'static str;
+
+    fn of(rules: RulesSpec) -> Vec<Self>;
+    fn name(&self) -> &str;
+    fn rule(self) -> Result<Rule, RuleError>;
+    fn removal(id: RuleId) -> RuleEdit;
+}
+
+impl Drawn for LineSpec {
+    const WHAT: &'static str = Line::WHAT;
+    const PLURAL: &'static str = "lines";
+
+    fn of(rules: RulesSpec) -> Vec<Self> {
+        rules.lines
+    }
+
+    fn name(&self) -> &str {
+        &self.id
+    }
+
+    fn rule(self) -> Result<Rule, RuleError> {
+        self.try_into().map(Rule::Line)
+    }
+
+    fn removal(id: RuleId) -> RuleEdit {
+        RuleEdit::RemoveLine(id)
+    }
+}
+
+impl Drawn for ZoneSpec {
+    const WHAT: &'static str = Zone::WHAT;
+    const PLURAL: &'static str = "zones";
+
+    fn of(rules: RulesSpec) -> Vec<Self> {
+        rules.zones
+    }
+
+    fn name(&self) -> &str {
+        &self.id
+    }
+
+    fn rule(self) -> Result<Rule, RuleError> {
+        self.try_into().map(Rule::Zone)
+    }
+
+    fn removal(id: RuleId) -> RuleEdit {
+        RuleEdit::RemoveZone(id)
+    }
 }
 
 impl From<AnchorSpec> for Anchor {

@@ -3,14 +3,17 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::extract::ws::rejection::WebSocketUpgradeRejection;
+use axum::extract::FromRequestParts;
 use axum::extract::ws::{CloseFrame, Message, WebSocket, WebSocketUpgrade, close_code};
-use axum::http::{HeaderMap, header};
+use axum::http::request::Parts;
+use axum::http::{HeaderMap, HeaderValue, header};
+use axum::response::Response;
 use futures::stream::{SplitSink, SplitStream};
 use futures::{SinkExt, StreamExt};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
+use super::ApiState;
 use super::problem::Problem;
 use super::server::Stop;
 use crate::auth::{Gate, Identity};
@@ -47,17 +50,12 @@ pub(super) struct Sockets {
 }
 
 /// Whose stream it is. A stream ends soon after its bearer's token.
-#[derive(Clone)]
 pub(super) struct Pass {
     gate: Arc<Gate>,
     identity: Option<Identity>,
 }
 
 impl Pass {
-    pub fn new(gate: &Arc<Gate>, identity: Option<Identity>) -> Self {
-        Self { gate: gate.clone(), identity }
-    }
-
     pub fn is_valid(&self) -> bool {
         self.identity.as_ref().is_some_and(|identity| self.gate.still_knows(identity))
     }
@@ -84,26 +82,71 @@ impl Seats {
     }
 }
 
+/// A place among the streams that are open, free again when dropped, and whose it is.
+pub(super) struct Ticket {
+    _seat: OwnedSemaphorePermit,
+    pub pass: Pass,
+    pub stop: Stop,
+}
+
+impl FromRequestParts<ApiState> for Ticket {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, state: &ApiState) -> Result<Self, Problem> {
+        let identity = parts.extensions.get::<Option<Identity>>().cloned().flatten();
+        let pass = Pass { gate: state.gate.clone(), identity };
+        Ok(Self { _seat: state.seats.take()?, pass, stop: state.sockets.stop.clone() })
+    }
+}
+
+/// A WebSocket that may be opened.
+pub(super) struct Opening {
+    upgrade: WebSocketUpgrade,
+    keep_alive: KeepAlive,
+    ticket: Ticket,
+}
+
 /// Takes the upgrade if it is one and its origin may: a page of another site must not read tracks or
 /// pictures through its visitor's browser. Clients that are no browser send no `Origin`.
-pub(super) fn upgrade(
-    headers: &HeaderMap,
-    upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
-) -> Result<WebSocketUpgrade, Problem> {
-    let upgrade = upgrade.map_err(|rejection| {
-        Problem::upgrade_required(format!("open it with a WebSocket client: {}", rejection.body_text()))
-    })?;
-    if !same_origin(headers) {
-        return Err(Problem::forbidden_origin(
-            "a browser may open this WebSocket only from a page of this service",
-        ));
+impl FromRequestParts<ApiState> for Opening {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, state: &ApiState) -> Result<Self, Problem> {
+        let upgrade = WebSocketUpgrade::from_request_parts(parts, state).await.map_err(|rejection| {
+            Problem::upgrade_required(format!("open it with a WebSocket client: {}", rejection.body_text()))
+        })?;
+        if !same_origin(&parts.headers) {
+            return Err(Problem::forbidden_origin(
+                "a browser may open this WebSocket only from a page of this service",
+            ));
+        }
+        let upgrade = upgrade.max_message_size(MAX_INCOMING).max_frame_size(MAX_INCOMING);
+        let ticket = Ticket::from_request_parts(parts, state).await?;
+        Ok(Self { upgrade, keep_alive: state.sockets.keep_alive, ticket })
     }
-    Ok(upgrade.max_message_size(MAX_INCOMING).max_frame_size(MAX_INCOMING))
+}
+
+impl Opening {
+    /// Agrees on the first of the client's subprotocols that is `known`; [`Opening::protocol`] is that.
+    pub fn protocols(mut self, known: [&'static str; 2]) -> Self {
+        self.upgrade = self.upgrade.protocols(known);
+        self
+    }
+
+    pub fn protocol(&self) -> Option<&HeaderValue> {
+        self.upgrade.selected_protocol()
+    }
+
+    /// The answer; the socket then sends what `outgoing` has.
+    pub fn run(self, outgoing: impl Outgoing + 'static) -> Response {
+        let Self { upgrade, keep_alive, ticket } = self;
+        upgrade.on_upgrade(move |socket| run(socket, keep_alive, ticket, outgoing))
+    }
 }
 
 pub(super) fn same_origin(headers: &HeaderMap) -> bool {
     let Some(origin) = headers.get(header::ORIGIN) else { return true };
-    let text = |value: &axum::http::HeaderValue| value.to_str().ok().map(str::to_ascii_lowercase);
+    let text = |value: &HeaderValue| value.to_str().ok().map(str::to_ascii_lowercase);
     let Some(origin) = text(origin) else { return false };
     let host = headers.get(header::HOST).and_then(text);
     // The scheme is not compared: behind a proxy that ends TLS it differs.
@@ -123,8 +166,8 @@ pub(super) trait Outgoing: Send {
 }
 
 /// Sends what `outgoing` has until it ends, the peer goes, or the service stops.
-pub(super) async fn run(socket: WebSocket, sockets: Sockets, pass: Pass, mut outgoing: impl Outgoing) {
-    let Sockets { keep_alive, mut stop } = sockets;
+async fn run(socket: WebSocket, keep_alive: KeepAlive, ticket: Ticket, mut outgoing: impl Outgoing) {
+    let Ticket { _seat, pass, mut stop } = ticket;
     let (mut sender, mut receiver) = socket.split();
     let mut ping = interval(keep_alive.ping_every);
     ping.set_missed_tick_behavior(MissedTickBehavior::Delay);

@@ -4,25 +4,23 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::Extension;
 use axum::body::Bytes;
-use axum::extract::ws::rejection::WebSocketUpgradeRejection;
-use axum::extract::ws::{Message, Utf8Bytes, WebSocketUpgrade, close_code};
+use axum::extract::ws::{Message, Utf8Bytes, close_code};
 use axum::extract::{Query, State};
-use axum::http::{HeaderMap, header};
+use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use tokio::time::timeout;
 
 use super::ApiState;
 use super::drip::{self, Parts};
+use super::extract::known_camera;
 use super::problem::Problem;
-use super::socket::{self, Outgoing, Pass};
-use crate::auth::Identity;
+use super::socket::{Opening, Outgoing, Ticket};
 use crate::publish::{
     Event, Only, Sieve, Sifted, Subscription, TrackFilter, encode_gap_json, encode_gap_protobuf, encode_json,
     encode_protobuf,
 };
-use crate::types::{CameraId, ClassId, TrackState};
+use crate::types::{ClassId, TrackState};
 
 /// Subprotocol of JSON text messages, which is also what a client gets that names none.
 const JSON: &str = "gakp.v1.json";
@@ -34,38 +32,28 @@ const SILENCE: Duration = Duration::from_secs(10);
 pub(super) async fn tracks(
     State(state): State<ApiState>,
     Query(query): Query<Vec<(String, String)>>,
-    Extension(identity): Extension<Option<Identity>>,
-    headers: HeaderMap,
-    upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
+    opening: Opening,
 ) -> Result<Response, Problem> {
-    let upgrade = socket::upgrade(&headers, upgrade)?.protocols([PROTOBUF, JSON]);
+    let opening = opening.protocols([PROTOBUF, JSON]);
     let (only, filter) = wishes(&state, &query)?;
-    let seat = state.seats.take()?;
-    let format = match upgrade.selected_protocol() {
+    let format = match opening.protocol() {
         Some(protocol) if protocol == PROTOBUF => Format::Protobuf,
         _ => Format::Json,
     };
-    let (sockets, pass) = (state.sockets.clone(), Pass::new(&state.gate, identity));
     // Subscribed before the answer goes out: nothing published after the handshake is missed.
-    let stream = Messages::new(&state, only, filter, format);
-    Ok(upgrade.on_upgrade(|socket| async move {
-        let _seat = seat;
-        socket::run(socket, sockets, pass, TrackSocket(stream)).await;
-    }))
+    Ok(opening.run(TrackSocket(Messages::new(&state, only, filter, format))))
 }
 
 /// `GET /v1/tracks/stream`: Server-Sent Events, `tracks` and `gap`, each with a JSON message.
 pub(super) async fn stream(
     State(state): State<ApiState>,
     Query(query): Query<Vec<(String, String)>>,
-    Extension(identity): Extension<Option<Identity>>,
+    ticket: Ticket,
 ) -> Result<Response, Problem> {
     let (only, filter) = wishes(&state, &query)?;
-    let seat = state.seats.take()?;
-    let (stop, pass) = (state.sockets.stop.clone(), Pass::new(&state.gate, identity));
     let events = ServerSent(Messages::new(&state, only, filter, Format::Json));
     let headers = [(header::CONTENT_TYPE, "text/event-stream"), (header::CACHE_CONTROL, "no-store")];
-    Ok((headers, drip::body(events, stop, pass, seat)).into_response())
+    Ok((headers, drip::body(events, ticket)).into_response())
 }
 
 /// Which cameras, and what of their reports.
@@ -75,11 +63,7 @@ fn wishes(state: &ApiState, query: &[(String, String)]) -> Result<(Only, TrackFi
         let wrong = |what: String| Err(Problem::bad_request(format!("{key}={value:?} {what}")));
         match key.as_str() {
             "camera" => {
-                let id = CameraId::new(value)?;
-                if state.cameras.get(&id).is_none() {
-                    return Err(Problem::unknown_camera(value));
-                }
-                cameras.insert(id);
+                cameras.insert(known_camera(state, value)?);
             }
             "class" => match state.hub.classes().iter().position(|class| class == value) {
                 Some(class) => {

@@ -1,14 +1,15 @@
 //! The tokens that are known, in a file: names, roles and hashes, never a token.
 
 use std::fs;
-use std::io::{self, Write};
-use std::os::unix::fs::OpenOptionsExt;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
 use super::{ByName, Identity, Role, random_text, sha256};
+use crate::private;
+use crate::types::is_name;
 
 /// What tokens begin with, so that people and scanners know one when they see it.
 const PREFIX: &str = "gakp_";
@@ -102,18 +103,11 @@ impl TokenFile {
     /// # Errors
     /// [`TokenError::Io`].
     pub fn write(&self, path: &Path) -> Result<(), TokenError> {
-        let fresh = path.with_extension("json.new");
-        let write = || -> io::Result<()> {
-            if let Some(folder) = path.parent() {
-                fs::create_dir_all(folder)?;
-            }
-            let mut file =
-                fs::OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(&fresh)?;
-            file.write_all(serde_json::to_string_pretty(self)?.as_bytes())?;
-            file.sync_all()?;
-            fs::rename(&fresh, path)
-        };
-        write().map_err(|reason| TokenError::Io { verb: "write", path: path.into(), reason })
+        private::write_json(path, self).map_err(|reason| TokenError::Io {
+            verb: "write",
+            path: path.into(),
+            reason,
+        })
     }
 
     /// Whether it holds none.
@@ -131,10 +125,7 @@ impl TokenFile {
     /// # Errors
     /// The name is none, or taken.
     pub fn create(&mut self, name: &str, role: Role, video: bool) -> Result<NewToken, TokenError> {
-        let ok = (1..=64).contains(&name.len())
-            && name.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
-            && name.as_bytes()[0].is_ascii_alphanumeric();
-        if !ok {
+        if !is_name(name) {
             return Err(TokenError::Name(name.chars().take(80).collect()));
         }
         if self.tokens.contains_key(name) {

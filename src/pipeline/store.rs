@@ -2,13 +2,13 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::{self, Write};
-use std::os::unix::fs::OpenOptionsExt;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
 use crate::api::{NewCamera, RulesSpec};
+use crate::private;
 
 /// A file `cameras.json` in the state folder. It holds camera passwords, so only its owner may read it.
 pub struct Store {
@@ -80,25 +80,16 @@ impl Store {
         })
     }
 
-    /// Writes everything: to a new file that then takes the old one's place, so that a crash leaves
-    /// either the old or the new.
+    /// Writes everything; a crash leaves either the old or the new.
     ///
     /// # Errors
     /// [`StoreError::Io`].
     pub fn save(&self, remembered: &Remembered) -> Result<(), StoreError> {
-        let fresh = self.path.with_extension("json.new");
-        let write = || -> io::Result<()> {
-            let mut file =
-                fs::OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(&fresh)?;
-            file.write_all(serde_json::to_string_pretty(remembered)?.as_bytes())?;
-            file.sync_all()?;
-            fs::rename(&fresh, &self.path)?;
-            if let Some(folder) = self.path.parent() {
-                fs::File::open(folder)?.sync_all()?;
-            }
-            Ok(())
-        };
-        write().map_err(|reason| StoreError::Io { verb: "write", path: self.path.clone(), reason })
+        private::write_json(&self.path, remembered).map_err(|reason| StoreError::Io {
+            verb: "write",
+            path: self.path.clone(),
+            reason,
+        })
     }
 }
 

@@ -3,6 +3,14 @@
 use std::fmt;
 use std::sync::Arc;
 
+/// Whether a text can name a camera, a line, a zone or a token: 1 to 64 of `A-Z a-z 0-9 . _ -`, of which the first
+/// is a letter or digit.
+pub fn is_name(text: &str) -> bool {
+    (1..=64).contains(&text.len())
+        && text.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
+        && text.as_bytes()[0].is_ascii_alphanumeric()
+}
+
 /// A camera's name: 1 to 64 of `A-Z a-z 0-9 . _ -`, so that it fits a URL and a metric label.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct CameraId(Arc<str>);
@@ -15,10 +23,11 @@ pub struct CameraIdError(pub String);
 impl CameraId {
     /// Checks and takes a name.
     pub fn new(name: &str) -> Result<Self, CameraIdError> {
-        let ok = (1..=64).contains(&name.len())
-            && name.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
-            && name.as_bytes()[0].is_ascii_alphanumeric();
-        if ok { Ok(Self(name.into())) } else { Err(CameraIdError(name.chars().take(80).collect())) }
+        if is_name(name) {
+            Ok(Self(name.into()))
+        } else {
+            Err(CameraIdError(name.chars().take(80).collect()))
+        }
     }
 
     /// The name.

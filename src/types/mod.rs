@@ -12,6 +12,6 @@ mod tracks;
 pub use bbox::BBox;
 pub use detection::{Detection, Embedding};
 pub use frame::{Frame, Image, PixelBuffer, Plane, YuvMatrix, YuvRange};
-pub use ids::{CameraId, CameraIdError, ClassId, Epoch, TrackId};
+pub use ids::{CameraId, CameraIdError, ClassId, Epoch, TrackId, is_name};
 pub use time::{CaptureTime, Clock, MediaTime};
 pub use tracks::{FrameTracks, TrackReport, TrackState};

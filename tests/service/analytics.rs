@@ -13,12 +13,8 @@ fn crossings(counts: &Value) -> [u64; 2] {
 
 #[test]
 fn people_of_the_film_are_counted_and_rules_remembered() {
-    let (Some(_), Some(film)) = (models(), film()) else { return };
-    let folder = tempfile::tempdir().unwrap();
-    let state = folder.path().join("state");
-    let camera = format!("demo={}", film.display());
-    let args = ["--camera", camera.as_str(), "--loop"];
-    let service = Service::start(&state, &args);
+    let state = tempfile::tempdir().unwrap();
+    let Some(service) = Service::demo(state.path()) else { return };
     let mut events = service.socket("/v1/events/live?camera=demo");
     let door = json!({"id": "door", "points": [[0.5, 1.0], [0.5, 0.0]]});
     let all = json!([[0, 0], [1, 0], [1, 1], [0, 1]]);
@@ -76,7 +72,7 @@ fn people_of_the_film_are_counted_and_rules_remembered() {
     service.stop();
 
     // The camera is the command line's, its lines are remembered all the same.
-    let service = Service::start(&state, &args);
+    let service = Service::demo(state.path()).unwrap();
     let lines = service.get("/v1/cameras/demo/lines").json();
     let points = json!([[0.3, 1.0], [0.3, 0.0]]);
     assert_eq!(lines, json!({"lines": [{"id": "door", "points": points, "anchor": "foot"}]}));

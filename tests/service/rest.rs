@@ -111,12 +111,8 @@ fn cameras_are_remembered_and_forgotten_and_passwords_kept() {
 
 #[test]
 fn a_camera_is_paused_changed_and_resumed() {
-    let (Some(_), Some(film)) = (models(), film()) else { return };
-    let folder = tempfile::tempdir().unwrap();
-    let state = folder.path().join("state");
-    let camera = format!("demo={}", film.display());
-    let args = ["--camera", camera.as_str(), "--loop"];
-    let service = Service::start(&state, &args);
+    let state = tempfile::tempdir().unwrap();
+    let Some(service) = Service::demo(state.path()) else { return };
     let patch = |service: &Service, body: &str| service.request("PATCH", "/v1/cameras/demo", Some(body));
     let all = json!({"id": "all", "points": [[0, 0], [1, 0], [1, 1], [0, 1]]});
     assert_eq!(service.post("/v1/cameras/demo/zones", &all).status, 201);
@@ -147,7 +143,7 @@ fn a_camera_is_paused_changed_and_resumed() {
     service.stop();
 
     // It is the command line's camera, and stays paused all the same.
-    let service = Service::start(&state, &args);
+    let service = Service::demo(state.path()).unwrap();
     assert_eq!(service.camera("demo")["state"], "paused");
     let resumed = patch(&service, r#"{"paused": false}"#);
     assert_eq!(resumed.status, 200, "{resumed:?}");

@@ -258,6 +258,12 @@ impl Service {
         service
     }
 
+    /// Starts it with the demo film, over and over, as camera `demo`; `None` as for [`models`].
+    pub fn demo(state: &Path) -> Option<Self> {
+        let camera = format!("demo={}", film()?.display());
+        Some(Self::start(state, &["--camera", &camera, "--loop"]))
+    }
+
     /// Asks it to end and waits until it has; it must end well.
     pub fn stop(mut self) -> String {
         self.process.signal("TERM");

@@ -1,0 +1,63 @@
+//! What handlers take from a request; what is wrong with it is answered with a problem document.
+
+use axum::body::Bytes;
+use axum::extract::{FromRequest, FromRequestParts, Request};
+use axum::http::request::Parts;
+use axum::http::{StatusCode, header};
+use serde::de::DeserializeOwned;
+
+use super::object::Object;
+use super::problem::Problem;
+use super::{ApiState, MAX_BODY_BYTES};
+use crate::types::CameraId;
+
+/// What the path names. Unlike axum's own it answers a path that is no UTF-8 with a problem document.
+pub(super) struct Path<T>(pub T);
+
+impl<T: DeserializeOwned + Send, S: Send + Sync> FromRequestParts<S> for Path<T> {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Problem> {
+        match axum::extract::Path::from_request_parts(parts, state).await {
+            Ok(axum::extract::Path(names)) => Ok(Self(names)),
+            Err(rejection) => Err(Problem::bad_request(rejection.body_text())),
+        }
+    }
+}
+
+/// The body as JSON. Insisting on its media type keeps other sites' forms out: a browser sends
+/// `application/json` to another origin only after asking, and we do not allow it.
+pub(super) struct JsonBody<T>(pub T);
+
+impl<T: DeserializeOwned, S: Send + Sync> FromRequest<S> for JsonBody<T> {
+    type Rejection = Problem;
+
+    async fn from_request(request: Request, state: &S) -> Result<Self, Problem> {
+        let media_type =
+            request.headers().get(header::CONTENT_TYPE).and_then(|v| v.to_str().ok()).unwrap_or("");
+        if !media_type.split(';').next().unwrap_or("").trim().eq_ignore_ascii_case("application/json") {
+            return Err(Problem::media_type("send the body as `Content-Type: application/json`"));
+        }
+        let body =
+            Bytes::from_request(request, state).await.map_err(|rejection| match rejection.status() {
+                StatusCode::PAYLOAD_TOO_LARGE => {
+                    Problem::too_large(format!("a body may have at most {MAX_BODY_BYTES} bytes"))
+                }
+                _ => Problem::bad_request(format!("the body did not arrive: {}", rejection.body_text())),
+            })?;
+        serde_json::from_slice(&body)
+            .map(|Object(value)| Self(value))
+            .map_err(|error| Problem::bad_request(format!("the body is not valid: {error}")))
+    }
+}
+
+/// A name from a path: one that is not even a name has no camera, so it is a 404 as well.
+pub(super) fn camera_id(name: &str) -> Result<CameraId, Problem> {
+    CameraId::new(name).map_err(|_| Problem::unknown_camera(name))
+}
+
+/// A name from a query: of a camera that there is.
+pub(super) fn known_camera(state: &ApiState, name: &str) -> Result<CameraId, Problem> {
+    let id = CameraId::new(name)?;
+    state.cameras.get(&id).map(|_| id).ok_or_else(|| Problem::unknown_camera(name))
+}
