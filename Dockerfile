@@ -13,7 +13,7 @@
 # stay the same, give both images with their digests: --build-arg DEBIAN=debian@sha256:...
 
 ARG DEBIAN=debian:12.12-slim
-ARG RUST=rust:1.92-bookworm
+ARG RUST=rust:1.94-bookworm
 
 FROM ${RUST} AS build
 SHELL ["/bin/bash", "-euo", "pipefail", "-c"]

@@ -27,7 +27,7 @@ PACKAGES=(
     python3 python3-venv
 )
 # Prometheus and promtool; yamllint and systemd-analyze for what deploy/ ships.
-TEST_PACKAGES=(chromium ffmpeg fonts-dejavu-core prometheus python3 python3-venv systemd yamllint)
+TEST_PACKAGES=(chromium ffmpeg fonts-dejavu-core postgresql prometheus procps python3 python3-venv systemd yamllint)
 FOOTAGE=models/cache/vtest.avi
 FOOTAGE_SHA256=45cddc9490be69345cbdab64ca583be65987e864ca408038e648db99e10516cf
 

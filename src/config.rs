@@ -2,14 +2,17 @@
 //!
 //! Unknown keys are errors. What the file leaves out has the default that the core gives it.
 
+use std::fmt;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use anyhow::{Context, Result, bail, ensure};
 use serde::Deserialize;
 
 use crate::api::NewCamera;
 use crate::detect::DetectorSettings;
+use crate::history::{HistorySettings, Place};
 use crate::infer::ModelSettings;
 use crate::track::{Association, PairScore, TrackerConfig};
 use crate::tuning::Tuning;
@@ -30,6 +33,8 @@ pub struct Config {
     pub admin_token_file: Option<PathBuf>,
     /// Most cameras at a time.
     pub max_cameras: Option<usize>,
+    /// What is remembered of tracks and events.
+    pub history: HistoryConfig,
     /// Models and where they run.
     pub models: ModelConfig,
     /// The tracker's settings.
@@ -37,6 +42,61 @@ pub struct Config {
     /// Cameras.
     #[serde(rename = "camera")]
     pub cameras: Vec<NewCamera>,
+}
+
+/// `[history]`.
+#[derive(Clone, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct HistoryConfig {
+    /// A SQLite file, `postgres://USER@HOST/DATABASE`, or `none`.
+    pub database: Option<String>,
+    /// Days that tracks and events are kept; 0 for ever.
+    pub keep_days: Option<f64>,
+    /// Whether the best picture of each track is kept.
+    pub snapshots: bool,
+    /// Megabytes that they may take; 0 without end.
+    pub max_mb: Option<u32>,
+}
+
+impl fmt::Debug for HistoryConfig {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        // The URL may hold a password.
+        f.debug_struct("HistoryConfig").field("keep_days", &self.keep_days).finish_non_exhaustive()
+    }
+}
+
+impl HistoryConfig {
+    /// What to do; `None` when no history is kept. What is left out is that of [`HistorySettings::in_folder`].
+    ///
+    /// # Errors
+    /// A number is out of its range.
+    pub fn settings(&self, folder: &Path) -> Result<Option<HistorySettings>> {
+        let mut settings = HistorySettings::in_folder(folder);
+        match self.database.as_deref() {
+            None => {}
+            Some("none") => return Ok(None),
+            Some(url) if url.starts_with("postgres://") || url.starts_with("postgresql://") => {
+                settings.place = Place::Postgres(url.into());
+            }
+            Some(url) if url.contains("://") => {
+                bail!(
+                    "`[history] database` is a file, postgres://USER@HOST/DATABASE or none: its URL is of another kind"
+                )
+            }
+            Some(file) => settings.place = Place::Sqlite(file.into()),
+        }
+        if let Some(days) = self.keep_days {
+            ensure!(
+                (0.0..=36_500.0).contains(&days),
+                "`[history] keep_days` is {days}: must be from 0 to 36500"
+            );
+            settings.keep = (days > 0.0).then(|| Duration::from_secs_f64(days * 86_400.0));
+        }
+        if let Some(megabytes) = self.max_mb {
+            settings.max_bytes = (megabytes > 0).then(|| i64::from(megabytes) * 1_000_000);
+        }
+        Ok(Some(settings))
+    }
 }
 
 /// `[models]`.
@@ -323,6 +383,27 @@ impl TrackerOptions {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn history_is_kept_where_it_is_said() {
+        let settings = |text: &str| Config::parse(text).unwrap().history.settings(Path::new("/state"));
+        let kept = settings("").unwrap().unwrap();
+        assert_eq!(kept.place, Place::Sqlite("/state/history.sqlite".into()));
+        assert!(kept.keep == Some(Duration::from_secs(30 * 86_400)) && kept.max_bytes == Some(2_000_000_000));
+        let kept = settings("[history]\ndatabase = \"/x.db\"\nkeep_days = 0\nmax_mb = 0").unwrap().unwrap();
+        assert!(
+            kept.place == Place::Sqlite("/x.db".into()) && kept.keep.is_none() && kept.max_bytes.is_none()
+        );
+        let kept = settings("[history]\ndatabase = \"postgres://u:s3cret@h/d\"").unwrap().unwrap();
+        assert_eq!(kept.place, Place::Postgres("postgres://u:s3cret@h/d".into()));
+        assert!(settings("[history]\ndatabase = \"none\"").unwrap().is_none());
+        for wrong in ["database = \"mysql://u:s3cret@h/d\"", "keep_days = -1", "keep_days = nan"] {
+            let Err(error) = settings(&format!("[history]\n{wrong}")) else { panic!("{wrong} is taken") };
+            assert!(!error.to_string().contains("s3cret"), "{error}");
+        }
+        let config = Config::parse("[history]\ndatabase = \"postgres://u:s3cret@h/d\"").unwrap();
+        assert!(!format!("{config:?}").contains("s3cret"), "{config:?}");
+    }
 
     #[test]
     fn a_whole_file() {

@@ -45,6 +45,8 @@ pub mod api;
 #[cfg(feature = "service")]
 pub mod auth;
 #[cfg(feature = "service")]
+pub mod history;
+#[cfg(feature = "service")]
 pub mod publish;
 
 pub mod mot;

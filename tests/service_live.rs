@@ -11,12 +11,16 @@ mod cdp;
 mod ending;
 #[path = "service/failures.rs"]
 mod failures;
+#[path = "service/history.rs"]
+mod history;
 #[path = "service/page.rs"]
 mod page;
 #[path = "service/rest.rs"]
 mod rest;
 #[path = "service/scores.rs"]
 mod scores;
+#[path = "postgres/server.rs"]
+mod server;
 #[path = "service/support.rs"]
 mod support;
 #[path = "service/tracks.rs"]

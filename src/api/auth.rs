@@ -20,7 +20,7 @@ const VIEW: Right = Right::Role(Role::Viewer);
 const CHANGE: Right = Right::Role(Role::Operator);
 
 /// What each route asks for. One that is not here asks for an admin. `HEAD` asks for what `GET` does.
-pub const RIGHTS: [(&str, &str, Right); 32] = [
+pub const RIGHTS: [(&str, &str, Right); 41] = [
     ("GET", "/v1/cameras", VIEW),
     ("POST", "/v1/cameras", CHANGE),
     ("GET", "/v1/cameras/{id}", VIEW),
@@ -45,6 +45,15 @@ pub const RIGHTS: [(&str, &str, Right); 32] = [
     ("GET", "/v1/tracks/stream", VIEW),
     ("GET", "/v1/events", VIEW),
     ("GET", "/v1/events/live", VIEW),
+    ("GET", "/v1/history", VIEW),
+    ("GET", "/v1/history/tracks", VIEW),
+    ("GET", "/v1/history/tracks/{camera}/{epoch}/{track}", VIEW),
+    ("GET", "/v1/history/tracks/{camera}/{epoch}/{track}/snapshot.jpg", Right::Video),
+    ("GET", "/v1/history/tracks.csv", VIEW),
+    ("GET", "/v1/history/tracks.txt", VIEW),
+    ("GET", "/v1/history/events", VIEW),
+    ("GET", "/v1/history/events.csv", VIEW),
+    ("GET", "/v1/history/counts", VIEW),
     ("GET", "/v1/session", Right::Nobody),
     ("POST", "/v1/session", Right::Nobody),
     ("DELETE", "/v1/session", Right::Nobody),

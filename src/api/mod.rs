@@ -14,6 +14,7 @@
 //! /v1/tracks                       WebSocket: tracks as JSON or protobuf
 //! /v1/tracks/stream                the same as Server-Sent Events
 //! /v1/events[/live]                what happened at lines and in zones; a WebSocket of it
+//! /v1/history[/...]                tracks and events that were; counts over time; CSV, MOTChallenge
 //! /v1/openapi.json                all of this for programs
 //! /metrics /healthz /readyz
 //! ```
@@ -27,6 +28,7 @@ mod cameras;
 mod drip;
 mod events;
 mod extract;
+mod history;
 mod live;
 mod object;
 mod openapi;
@@ -37,6 +39,7 @@ mod rules;
 mod server;
 mod socket;
 mod ssrf;
+mod table;
 mod tracks;
 mod video;
 
@@ -58,6 +61,7 @@ pub use server::{serve, serve_with};
 pub use socket::KeepAlive;
 
 use crate::auth::Gate;
+use crate::history::Database;
 use crate::publish::{EventHub, Hub};
 use socket::{Seats, Sockets};
 use video::Studio;
@@ -77,6 +81,8 @@ pub struct ApiConfig {
     pub hub: Hub,
     /// What happens at lines and in zones.
     pub events: EventHub,
+    /// What was; without it no history is kept.
+    pub history: Option<Database>,
     /// What `/metrics` shows.
     pub registry: Registry,
     /// What `/readyz` asks.
@@ -93,6 +99,7 @@ struct ApiState {
     cameras: Arc<dyn Cameras>,
     hub: Hub,
     events: EventHub,
+    history: Option<Database>,
     registry: Registry,
     readiness: Readiness,
     gate: Arc<Gate>,
@@ -104,10 +111,11 @@ struct ApiState {
 }
 
 fn router(config: ApiConfig, sockets: Sockets) -> Router {
-    let ApiConfig { cameras, hub, events, registry, readiness, gate, tls } = config;
+    let ApiConfig { cameras, hub, events, history, registry, readiness, gate, tls } = config;
     let studio = Arc::new(Studio::default());
     let (seats, secure) = (Seats::default(), tls.is_some());
-    let state = ApiState { cameras, hub, events, registry, readiness, gate, secure, studio, seats, sockets };
+    let state =
+        ApiState { cameras, hub, events, history, registry, readiness, gate, secure, studio, seats, sockets };
     Router::new()
         .route("/v1/cameras", get(rest::list).post(rest::add))
         .route("/v1/cameras/{id}", get(rest::get).patch(rest::patch).delete(rest::remove))
@@ -124,6 +132,15 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
         .route("/v1/tracks/stream", get(tracks::stream))
         .route("/v1/events", get(events::recent))
         .route("/v1/events/live", get(events::live))
+        .route("/v1/history", get(history::summary))
+        .route("/v1/history/tracks", get(history::tracks))
+        .route("/v1/history/tracks/{camera}/{epoch}/{track}", get(history::track))
+        .route("/v1/history/tracks/{camera}/{epoch}/{track}/snapshot.jpg", get(history::snapshot))
+        .route("/v1/history/tracks.csv", get(history::tracks_csv))
+        .route("/v1/history/tracks.txt", get(history::tracks_mot))
+        .route("/v1/history/events", get(history::events))
+        .route("/v1/history/events.csv", get(history::events_csv))
+        .route("/v1/history/counts", get(history::counts))
         .route("/v1/openapi.json", get(openapi::document))
         .route("/metrics", get(rest::metrics))
         .route("/healthz", get(rest::healthz))

@@ -12,9 +12,10 @@ use tokio_rustls::rustls::ServerConfig;
 
 use super::models::ModelArgs;
 use super::signals::Signals;
-use crate::api::{self, ApiConfig, NewCamera};
+use crate::api::{self, ApiConfig, Cameras, NewCamera};
 use crate::auth::{Gate, TokenFile, tls};
 use crate::config::{Config, TrackerOptions};
+use crate::history::{History, HistoryMetrics, HistorySettings, Pictures};
 use crate::infer::Models;
 use crate::pipeline::{CameraSet, Lanes, MAX_CAMERAS, SetConfig, Store, source_spec};
 use crate::publish::{EventHub, Hub, HubConfig};
@@ -55,6 +56,11 @@ pub struct Args {
     /// File with an admin's token of at least 32 characters, for secrets of containers; besides those of `gakp token`.
     #[arg(long, env = "GAKP_ADMIN_TOKEN_FILE", value_name = "FILE")]
     admin_token_file: Option<PathBuf>,
+    /// What is remembered of tracks and events: a SQLite file, postgres://USER@HOST/DATABASE or none [default:
+    /// history.sqlite in the state folder].
+    // An URL may hold a password; it is read from the environment as well, where other users do not see it.
+    #[arg(long, env = "GAKP_HISTORY", hide_env_values = true, value_name = "WHERE")]
+    history: Option<String>,
     /// Most cameras at a time [default: 64].
     #[arg(long, value_name = "N")]
     max_cameras: Option<usize>,
@@ -94,6 +100,9 @@ struct Plan {
     gate: Gate,
     tls: Option<Arc<ServerConfig>>,
     limit: usize,
+    history: Option<HistorySettings>,
+    /// Whether the history keeps pictures.
+    snapshots: bool,
     tracker: TrackerOptions,
     models: crate::infer::ModelSettings,
 }
@@ -129,6 +138,8 @@ impl Plan {
         let listen = args.listen.or(config.listen).unwrap_or(SocketAddr::from(([127, 0, 0, 1], 8080)));
         let local = listen.ip().is_loopback();
         let store = Store::open(&state_dir)?;
+        let mut kept = config.history;
+        kept.database = args.history.or(kept.database);
         let mut gate = Gate::new(TokenFile::path(&state_dir), local)?;
         if let Some(file) = args.admin_token_file.or(config.admin_token_file) {
             gate.admit_admin(&file)?;
@@ -152,6 +163,8 @@ impl Plan {
             cameras,
             store,
             limit,
+            history: kept.settings(&state_dir)?,
+            snapshots: kept.snapshots,
             tracker,
             models: crate::config::ModelConfig::from(args.models).or(config.models).settings()?,
         })
@@ -162,7 +175,7 @@ async fn serve(plan: Plan) -> Result<()> {
     let mut signals = Signals::listen()?;
     let (stop, stopped) = oneshot::channel();
     let mut service = std::pin::pin!(async {
-        let Service { listener, config, set } = start(plan).await?;
+        let Service { listener, config, set, history } = start(plan).await?;
         let hub = config.hub.clone();
         let served = api::serve(listener, config, async {
             // An error means that nobody can ask for the end any more: that is the end too.
@@ -171,6 +184,9 @@ async fn serve(plan: Plan) -> Result<()> {
         .await;
         hub.close();
         set.shutdown().await;
+        if let Some(history) = history {
+            history.stop().await;
+        }
         served.context("the HTTP server failed")
     });
     tokio::select! {
@@ -194,6 +210,7 @@ struct Service {
     listener: TcpListener,
     config: ApiConfig,
     set: Arc<CameraSet>,
+    history: Option<History>,
 }
 
 /// Loads the models, takes the port, starts the cameras: in this order, so that a mistake leaves
@@ -224,6 +241,14 @@ async fn start(plan: Plan) -> Result<Service> {
         store: Some(plan.store),
         limit: plan.limit,
     });
+    let history = match plan.history {
+        Some(mut settings) => {
+            settings.pictures = plan.snapshots.then(|| newest_pictures(set.clone()));
+            let figures = HistoryMetrics::new(metrics.registry())?;
+            Some(History::start(settings, &hub, &events, figures).await?)
+        }
+        None => None,
+    };
     for camera in plan.cameras {
         let id = camera.id.clone();
         set.start_configured(camera).await.with_context(|| format!("camera {:?}", id.as_str()))?;
@@ -235,13 +260,22 @@ async fn start(plan: Plan) -> Result<Service> {
         cameras: set.clone(),
         hub,
         events,
+        history: history.as_ref().map(|history| history.database().clone()),
         registry: metrics.registry().clone(),
         // Models are warm before the port is bound: who can ask finds the service ready.
         readiness: Arc::new(Vec::new),
         gate: Arc::new(plan.gate),
         tls: plan.tls,
     };
-    Ok(Service { listener, config, set })
+    Ok(Service { listener, config, set, history })
+}
+
+/// The newest picture of each camera.
+fn newest_pictures(set: Arc<CameraSet>) -> Pictures {
+    Arc::new(move || {
+        let ids = set.list().into_iter().map(|status| status.id);
+        ids.filter_map(|id| set.video(&id)?.borrow().clone()).collect()
+    })
 }
 
 /// The value of --camera; errors repeat nothing of the URL.

@@ -14,7 +14,7 @@ use tokio::sync::broadcast;
 use super::json::{CaptureTs, encode, round};
 use super::report::class_name;
 use crate::analytics::{Happening, What};
-use crate::types::{CameraId, FrameTracks};
+use crate::types::{CameraId, Epoch, FrameTracks};
 
 /// Events that a listener may lag behind.
 const LAG: usize = 1024;
@@ -34,6 +34,12 @@ pub struct NumberedEvent {
     pub kind: &'static str,
     /// Where.
     pub camera: CameraId,
+    /// Generation of the camera's track ids.
+    pub epoch: Epoch,
+    /// When the frame was captured, nanoseconds since 1970.
+    pub unix_ns: i64,
+    /// What, and who.
+    pub happening: Happening,
     /// The JSON message (docs/api.md).
     pub json: Bytes,
 }
@@ -134,7 +140,15 @@ impl EventHub {
         let id = format!("{}-{}", shared.run, shared.next.fetch_add(1, Ordering::Relaxed));
         let kind = event_kind(&happening.what);
         let json = message(&id, kind, report, happening, &shared.classes);
-        let event = Arc::new(NumberedEvent { id, kind, camera: report.camera.clone(), json });
+        let event = Arc::new(NumberedEvent {
+            id,
+            kind,
+            camera: report.camera.clone(),
+            epoch: report.epoch,
+            unix_ns: report.capture.unix_ns,
+            happening: happening.clone(),
+            json,
+        });
         let mut recent = self.recent_events();
         if recent.len() == KEPT {
             recent.pop_front();

@@ -51,7 +51,7 @@ struct Hole {
 }
 
 /// RFC 3339 with nine decimals, in UTC.
-pub(super) struct CaptureTs(pub(super) i64);
+pub(crate) struct CaptureTs(pub(crate) i64);
 
 impl Serialize for CaptureTs {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {

@@ -18,6 +18,8 @@ pub use draw::{Trails, annotate, colour};
 pub use event::{EVENT_KINDS, EventFilter, EventHub, EventListener, Heard, NumberedEvent, event_kind};
 pub use filter::{Sieve, Sifted, TrackFilter};
 pub use hub::{Event, Gap, Hub, HubConfig, HubMetrics, Only, Subscription};
+pub(crate) use json::CaptureTs;
 pub use picture::{Picture, PictureError, Rgb, RgbConverter};
 pub use protobuf::wire;
+pub(crate) use report::class_name;
 pub use report::{Report, encode_gap_json, encode_gap_protobuf, encode_json, encode_protobuf};

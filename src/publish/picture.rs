@@ -56,6 +56,22 @@ impl Rgb {
         [self.data[at], self.data[at + 1], self.data[at + 2]]
     }
 
+    /// What of it is between `left, top, right, bottom`; empty when that is outside.
+    pub fn part(&self, [left, top, right, bottom]: [f64; 4]) -> Rgb {
+        // `as` saturates: what is negative or NaN is 0.
+        let clamp = |from: f64, to: f64, size: usize| {
+            let from = (from.floor() as usize).min(size);
+            from..(to.ceil() as usize).clamp(from, size)
+        };
+        let (columns, rows) = (clamp(left, right, self.width), clamp(top, bottom, self.height));
+        let (width, height) = (columns.len(), rows.len());
+        let row = |y: usize| {
+            let start = (y * self.width + columns.start) * 3;
+            &self.data[start..start + width * 3]
+        };
+        Rgb { width, height, data: rows.flat_map(row).copied().collect() }
+    }
+
     /// This picture as JPEG (4:2:0 below quality 90).
     ///
     /// # Errors
@@ -195,6 +211,19 @@ mod tests {
             assert_eq!((out.width, out.height), expected);
             assert_eq!(out.data.len(), out.width * out.height * 3);
             assert!(out.data.iter().all(|v| *v >= 254), "{size:?} is white");
+        }
+    }
+
+    #[test]
+    fn a_part_is_cut_at_the_border() {
+        let data = (0..4 * 3 * 3).map(|i| i as u8 / 3).collect();
+        let whole = Rgb { width: 4, height: 3, data };
+        let part = whole.part([2.5, 1.0, 99.0, 2.2]);
+        assert_eq!((part.width, part.height), (2, 2));
+        assert_eq!((part.pixel(0, 0)[0], part.pixel(1, 1)[2]), (6, 11));
+        for outside in [[-9.0, -9.0, -1.0, -1.0], [5.0, 0.0, 9.0, 3.0], [f64::NAN; 4]] {
+            let part = whole.part(outside);
+            assert!(part.width * part.height == 0 && part.data.is_empty(), "{outside:?}");
         }
     }
 

@@ -36,7 +36,7 @@ impl Report {
 
 /// The name of a class on the wire; `class-N` where the table is too short, so that a consumer can
 /// still tell classes apart.
-pub(super) fn class_name(classes: &[String], class: ClassId) -> std::borrow::Cow<'_, str> {
+pub(crate) fn class_name(classes: &[String], class: ClassId) -> std::borrow::Cow<'_, str> {
     match classes.get(usize::from(class.0)) {
         Some(name) => name.as_str().into(),
         None => format!("class-{}", class.0).into(),

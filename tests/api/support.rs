@@ -244,6 +244,7 @@ impl Server {
             cameras: cameras.clone(),
             hub: hub.clone(),
             events: events.clone(),
+            history: None,
             registry,
             readiness: Arc::new(move || match answer.load(Ordering::SeqCst) {
                 true => vec![],

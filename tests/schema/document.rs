@@ -66,9 +66,9 @@ fn every_route_is_described_and_nothing_else() {
             .into_iter()
             .flatten()
             .flat_map(|list| list.as_array().unwrap())
-            .map(|parameter| {
-                let pointer = parameter["$ref"].as_str().unwrap().trim_start_matches('#');
-                document.pointer(pointer).unwrap()
+            .map(|parameter| match parameter["$ref"].as_str() {
+                Some(pointer) => document.pointer(pointer.trim_start_matches('#')).unwrap(),
+                None => parameter,
             })
             .filter(|parameter| parameter["in"] == "path")
             .map(|parameter| parameter["name"].as_str().unwrap())

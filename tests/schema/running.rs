@@ -147,10 +147,9 @@ fn the_running_service_keeps_to_the_document() {
             let well = if first == 101 { 426 } else { first };
             let statuses = seen.get(name).cloned().unwrap_or_default();
             println!("{name}: {statuses:?}");
-            assert!(
-                name == "stream" || statuses.contains(&well),
-                "{name} was never answered {well}: {statuses:?}"
-            );
+            // There is nobody in the test picture to be remembered: tests/service/history.rs asks for tracks.
+            let elsewhere = ["stream", "historyTrack", "historySnapshot"].contains(&name);
+            assert!(elsewhere || statuses.contains(&well), "{name} was never answered {well}: {statuses:?}");
         }
     }
 }
