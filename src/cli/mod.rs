@@ -6,6 +6,8 @@ pub mod ablate;
 pub mod bench;
 #[cfg(feature = "testcam")]
 pub mod camera;
+#[cfg(feature = "service")]
+pub mod check;
 pub mod eval;
 #[cfg(feature = "service")]
 mod models;
@@ -47,6 +49,9 @@ pub enum Command {
     /// Run the service: cameras in, tracks out.
     #[cfg(feature = "service")]
     Serve(serve::Args),
+    /// Try everything that the service needs and report: settings, models, GPU, address, history, cameras.
+    #[cfg(feature = "service")]
+    Check(check::Args),
     /// Make, list and revoke the tokens that the API asks for.
     #[cfg(feature = "service")]
     Token(token::Args),
@@ -85,6 +90,8 @@ pub fn run(cli: Cli) -> anyhow::Result<()> {
     match cli.command {
         #[cfg(feature = "service")]
         Command::Serve(args) => serve::run(args),
+        #[cfg(feature = "service")]
+        Command::Check(args) => check::run(args),
         #[cfg(feature = "service")]
         Command::Token(args) => token::run(args),
         #[cfg(feature = "service")]

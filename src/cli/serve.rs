@@ -93,22 +93,27 @@ pub fn run(args: Args) -> Result<()> {
 }
 
 /// Everything that can be checked without opening anything.
-struct Plan {
-    listen: SocketAddr,
-    cameras: Vec<NewCamera>,
-    store: (Store, crate::pipeline::Remembered),
-    gate: Gate,
+pub(super) struct Plan {
+    pub(super) listen: SocketAddr,
+    pub(super) cameras: Vec<NewCamera>,
+    pub(super) state_dir: PathBuf,
+    pub(super) store: (Store, crate::pipeline::Remembered),
+    pub(super) gate: Gate,
     tls: Option<Arc<ServerConfig>>,
     limit: usize,
-    history: Option<HistorySettings>,
+    pub(super) history: Option<HistorySettings>,
     /// Whether the history keeps pictures.
     snapshots: bool,
-    tracker: TrackerOptions,
-    models: crate::infer::ModelSettings,
+    pub(super) tracker: TrackerOptions,
+    pub(super) models: crate::infer::ModelSettings,
 }
 
 impl Plan {
-    fn new(args: Args) -> Result<Self> {
+    /// Reads and checks all settings.
+    ///
+    /// # Errors
+    /// The first that is wrong.
+    pub(super) fn new(args: Args) -> Result<Self> {
         let config = args.config.as_deref().map(Config::read).transpose()?.unwrap_or_default();
         let tracker = config.tracker.tuned(args.tuning)?;
         let mut cameras = config.cameras;
@@ -164,6 +169,7 @@ impl Plan {
             store,
             limit,
             history: kept.settings(&state_dir)?,
+            state_dir,
             snapshots: kept.snapshots,
             tracker,
             models: crate::config::ModelConfig::from(args.models).or(config.models).settings()?,

@@ -169,6 +169,15 @@ impl Database {
         Ok(transaction.commit().await?)
     }
 
+    /// Whether it answers. Changes nothing.
+    ///
+    /// # Errors
+    /// The database's.
+    pub async fn ping(&self) -> Result<(), HistoryError> {
+        self.pool.execute("SELECT 1").await?;
+        Ok(())
+    }
+
     /// `sqlite` or `postgres`.
     pub fn name(&self) -> &'static str {
         if self.is_sqlite { "sqlite" } else { "postgres" }
