@@ -172,6 +172,34 @@ pub struct TrackerOptions {
 }
 
 impl Config {
+    /// What differs from `other` besides cameras: none of it can change while the service runs.
+    pub fn differs(&self, other: &Config) -> Vec<String> {
+        let Config {
+            listen,
+            state_dir,
+            tls_cert,
+            tls_key,
+            admin_token_file,
+            max_cameras,
+            history,
+            models,
+            tracker,
+            cameras: _,
+        } = self;
+        let settings = [
+            ("listen", *listen == other.listen),
+            ("state_dir", *state_dir == other.state_dir),
+            ("tls_cert", *tls_cert == other.tls_cert),
+            ("tls_key", *tls_key == other.tls_key),
+            ("admin_token_file", *admin_token_file == other.admin_token_file),
+            ("max_cameras", *max_cameras == other.max_cameras),
+            ("history", *history == other.history),
+            ("models", *models == other.models),
+            ("tracker", *tracker == other.tracker),
+        ];
+        settings.into_iter().filter(|(_, same)| !same).map(|(name, _)| name.to_owned()).collect()
+    }
+
     /// Reads a file.
     ///
     /// # Errors

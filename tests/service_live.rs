@@ -15,6 +15,8 @@ mod failures;
 mod history;
 #[path = "service/page.rs"]
 mod page;
+#[path = "service/reload.rs"]
+mod reload;
 #[path = "service/rest.rs"]
 mod rest;
 #[path = "service/scores.rs"]

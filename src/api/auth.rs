@@ -18,9 +18,10 @@ const COOKIE: &str = "gakp_session";
 
 const VIEW: Right = Right::Role(Role::Viewer);
 const CHANGE: Right = Right::Role(Role::Operator);
+const ADMIN: Right = Right::Role(Role::Admin);
 
 /// What each route asks for. One that is not here asks for an admin. `HEAD` asks for what `GET` does.
-pub const RIGHTS: [(&str, &str, Right); 41] = [
+pub const RIGHTS: [(&str, &str, Right); 44] = [
     ("GET", "/v1/cameras", VIEW),
     ("POST", "/v1/cameras", CHANGE),
     ("GET", "/v1/cameras/{id}", VIEW),
@@ -58,6 +59,9 @@ pub const RIGHTS: [(&str, &str, Right); 41] = [
     ("POST", "/v1/session", Right::Nobody),
     ("DELETE", "/v1/session", Right::Nobody),
     ("GET", "/v1/openapi.json", Right::Nobody),
+    ("GET", "/v1/log", ADMIN),
+    ("PUT", "/v1/log", ADMIN),
+    ("POST", "/v1/reload", ADMIN),
     ("GET", "/metrics", VIEW),
     ("GET", "/healthz", Right::Nobody),
     ("GET", "/readyz", Right::Nobody),

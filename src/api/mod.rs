@@ -16,6 +16,7 @@
 //! /v1/events[/live]                what happened at lines and in zones; a WebSocket of it
 //! /v1/history[/...]                tracks and events that were; counts over time; CSV, MOTChallenge
 //! /v1/openapi.json                all of this for programs
+//! /v1/log /v1/reload               what is logged; reading the configuration again
 //! /metrics /healthz /readyz
 //! ```
 //!
@@ -32,6 +33,7 @@ mod history;
 mod live;
 mod object;
 mod openapi;
+mod operations;
 mod page;
 mod problem;
 mod rest;
@@ -48,7 +50,7 @@ use std::sync::Arc;
 use axum::Router;
 use axum::extract::DefaultBodyLimit;
 use axum::middleware::from_fn_with_state;
-use axum::routing::get;
+use axum::routing::{get, post};
 use prometheus::Registry;
 use tokio_rustls::rustls::ServerConfig;
 
@@ -56,6 +58,7 @@ pub use auth::RIGHTS;
 pub use cameras::{
     CameraError, CameraPatch, CameraState, CameraStatus, Cameras, NewCamera, TrackCounts, Transport,
 };
+pub use operations::{Operations, Reloaded};
 pub use rules::{AnchorSpec, EditError, Findings, LineSpec, Rule, RuleEdit, RulesSpec, ZoneSpec};
 pub use server::{serve, serve_with};
 pub use socket::KeepAlive;
@@ -89,6 +92,8 @@ pub struct ApiConfig {
     pub readiness: Readiness,
     /// Who may come in.
     pub gate: Arc<Gate>,
+    /// What an admin may change while it runs.
+    pub operations: Option<Arc<dyn Operations>>,
     /// Certificate and key; without them it is plain HTTP.
     pub tls: Option<Arc<ServerConfig>>,
 }
@@ -103,6 +108,7 @@ struct ApiState {
     registry: Registry,
     readiness: Readiness,
     gate: Arc<Gate>,
+    operations: Option<Arc<dyn Operations>>,
     /// Whether connections are encrypted.
     secure: bool,
     studio: Arc<Studio>,
@@ -111,11 +117,23 @@ struct ApiState {
 }
 
 fn router(config: ApiConfig, sockets: Sockets) -> Router {
-    let ApiConfig { cameras, hub, events, history, registry, readiness, gate, tls } = config;
+    let ApiConfig { cameras, hub, events, history, registry, readiness, gate, operations, tls } = config;
     let studio = Arc::new(Studio::default());
     let (seats, secure) = (Seats::default(), tls.is_some());
-    let state =
-        ApiState { cameras, hub, events, history, registry, readiness, gate, secure, studio, seats, sockets };
+    let state = ApiState {
+        cameras,
+        hub,
+        events,
+        history,
+        registry,
+        readiness,
+        gate,
+        operations,
+        secure,
+        studio,
+        seats,
+        sockets,
+    };
     Router::new()
         .route("/v1/cameras", get(rest::list).post(rest::add))
         .route("/v1/cameras/{id}", get(rest::get).patch(rest::patch).delete(rest::remove))
@@ -142,6 +160,8 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
         .route("/v1/history/events.csv", get(history::events_csv))
         .route("/v1/history/counts", get(history::counts))
         .route("/v1/openapi.json", get(openapi::document))
+        .route("/v1/log", get(operations::log).put(operations::set_log))
+        .route("/v1/reload", post(operations::reload))
         .route("/metrics", get(rest::metrics))
         .route("/healthz", get(rest::healthz))
         .route("/readyz", get(rest::readyz))

@@ -9,8 +9,11 @@ pub mod camera;
 #[cfg(feature = "service")]
 pub mod check;
 pub mod eval;
+mod log;
 #[cfg(feature = "service")]
 mod models;
+#[cfg(feature = "service")]
+mod reload;
 #[cfg(feature = "service")]
 pub mod serve;
 #[cfg(any(feature = "service", feature = "testcam"))]
@@ -26,7 +29,7 @@ pub mod train;
 #[cfg(feature = "learn")]
 pub mod tune;
 
-use std::io::{self, IsTerminal};
+use anyhow::Context;
 
 /// Point it at RTSP cameras, subscribe to tracks.
 #[derive(clap::Parser)]
@@ -86,7 +89,7 @@ pub enum Command {
 /// # Errors
 /// Whatever stops it; the message says what was wrong, where, and what to do.
 pub fn run(cli: Cli) -> anyhow::Result<()> {
-    start_log(&cli.log, cli.log_json)?;
+    log::start(&cli.log, cli.log_json).context("--log")?;
     match cli.command {
         #[cfg(feature = "service")]
         Command::Serve(args) => serve::run(args),
@@ -110,23 +113,4 @@ pub fn run(cli: Cli) -> anyhow::Result<()> {
         #[cfg(feature = "learn")]
         Command::Tune(args) => tune::run(args),
     }
-}
-
-/// Logs go to standard error; what a command prints goes to standard output.
-fn start_log(level: &str, json: bool) -> anyhow::Result<()> {
-    // A word that is no level would be taken as a module's name, and all else would fall silent.
-    let levels = level.split(',').filter(|part| !part.contains(['=', '[']));
-    for word in levels.map(str::trim) {
-        let known = word.parse::<tracing_subscriber::filter::LevelFilter>().is_ok();
-        anyhow::ensure!(known, "--log {level:?}: {word:?} is none of off, error, warn, info, debug, trace");
-    }
-    // ONNX Runtime tells every step of its optimiser; say `ort=info` to hear it.
-    let filter = tracing_subscriber::EnvFilter::try_new(format!("ort=warn,{level}"))
-        .map_err(|e| anyhow::anyhow!("--log {level:?}: {e}; use error, warn, info, debug or trace"))?;
-    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr);
-    let started = match json {
-        true => log.json().try_init(),
-        false => log.with_ansi(io::stderr().is_terminal()).try_init(),
-    };
-    started.map_err(|e| anyhow::anyhow!("cannot start logging: {e}"))
 }

@@ -8,12 +8,13 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail};
 use tokio::net::TcpListener;
 use tokio::sync::oneshot;
-use tokio_rustls::rustls::ServerConfig;
 
 use super::models::ModelArgs;
-use super::signals::Signals;
+use super::reload::Reloader;
+use super::signals::{self, Signals};
 use crate::api::{self, ApiConfig, Cameras, NewCamera};
-use crate::auth::{Gate, TokenFile, tls};
+use crate::auth::tls::Certificates;
+use crate::auth::{Gate, TokenFile};
 use crate::config::{Config, TrackerOptions};
 use crate::history::{History, HistoryMetrics, HistorySettings, Pictures};
 use crate::infer::Models;
@@ -94,12 +95,14 @@ pub fn run(args: Args) -> Result<()> {
 
 /// Everything that can be checked without opening anything.
 pub(super) struct Plan {
+    /// What it was made of.
+    args: Args,
     pub(super) listen: SocketAddr,
     pub(super) cameras: Vec<NewCamera>,
     pub(super) state_dir: PathBuf,
     pub(super) store: (Store, crate::pipeline::Remembered),
     pub(super) gate: Gate,
-    tls: Option<Arc<ServerConfig>>,
+    certificates: Option<Arc<Certificates>>,
     limit: usize,
     pub(super) history: Option<HistorySettings>,
     /// Whether the history keeps pictures.
@@ -108,13 +111,23 @@ pub(super) struct Plan {
     pub(super) models: crate::infer::ModelSettings,
 }
 
+impl Args {
+    /// The configuration that they name; an empty one where they name none.
+    ///
+    /// # Errors
+    /// As [`Config::read`].
+    pub(super) fn configuration(&self) -> Result<Config> {
+        Ok(self.config.as_deref().map(Config::read).transpose()?.unwrap_or_default())
+    }
+}
+
 impl Plan {
     /// Reads and checks all settings.
     ///
     /// # Errors
     /// The first that is wrong.
     pub(super) fn new(args: Args) -> Result<Self> {
-        let config = args.config.as_deref().map(Config::read).transpose()?.unwrap_or_default();
+        let (given, config) = (args.clone(), args.configuration()?);
         let tracker = config.tracker.tuned(args.tuning)?;
         let mut cameras = config.cameras;
         for text in &args.cameras {
@@ -156,15 +169,16 @@ impl Plan {
                 state_dir.display()
             );
         }
-        let tls = match (args.tls_cert.or(config.tls_cert), args.tls_key.or(config.tls_key)) {
-            (Some(cert), Some(key)) => Some(tls::load(&cert, &key)?),
+        let certificates = match (args.tls_cert.or(config.tls_cert), args.tls_key.or(config.tls_key)) {
+            (Some(cert), Some(key)) => Some(Certificates::read(&cert, &key)?),
             (None, None) => None,
             _ => bail!("--tls-cert and --tls-key belong together: one of them is missing"),
         };
         Ok(Self {
+            args: given,
             listen,
             gate,
-            tls,
+            certificates,
             cameras,
             store,
             limit,
@@ -255,12 +269,16 @@ async fn start(plan: Plan) -> Result<Service> {
         }
         None => None,
     };
+    let reloader = Reloader::new(plan.args, plan.cameras.clone(), set.clone(), plan.certificates.clone())?;
+    let reloader = Arc::new(reloader);
+    let tls = plan.certificates.map(|certificates| certificates.server()).transpose()?;
     for camera in plan.cameras {
         let id = camera.id.clone();
         set.start_configured(camera).await.with_context(|| format!("camera {:?}", id.as_str()))?;
     }
     set.start_remembered().await;
-    let scheme = if plan.tls.is_some() { "https" } else { "http" };
+    tokio::spawn(signals::on_hangup(reloader.clone())?);
+    let scheme = if tls.is_some() { "https" } else { "http" };
     tracing::info!("the page is at {scheme}://{address}/");
     let config = ApiConfig {
         cameras: set.clone(),
@@ -271,7 +289,8 @@ async fn start(plan: Plan) -> Result<Service> {
         // Models are warm before the port is bound: who can ask finds the service ready.
         readiness: Arc::new(Vec::new),
         gate: Arc::new(plan.gate),
-        tls: plan.tls,
+        operations: Some(reloader),
+        tls,
     };
     Ok(Service { listener, config, set, history })
 }

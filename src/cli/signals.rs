@@ -1,4 +1,7 @@
-//! Being told to end.
+//! Being told to end, and to read the configuration again.
+
+#[cfg(feature = "service")]
+use std::sync::Arc;
 
 use anyhow::{Context, Result};
 use tokio::signal::unix::{Signal, SignalKind, signal};
@@ -23,4 +26,19 @@ impl Signals {
             _ = self.int.recv() => {}
         }
     }
+}
+
+/// Reads the configuration again at every SIGHUP. From here on it ends nothing.
+///
+/// # Errors
+/// The signal cannot be listened for.
+#[cfg(feature = "service")]
+pub fn on_hangup(operations: Arc<impl crate::api::Operations + 'static>) -> Result<impl Future<Output = ()>> {
+    let mut hangup = signal(SignalKind::hangup()).context("cannot listen for signals")?;
+    Ok(async move {
+        while hangup.recv().await.is_some() {
+            // What came of it is logged.
+            let _ = operations.reload().await;
+        }
+    })
 }

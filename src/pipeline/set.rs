@@ -114,6 +114,34 @@ impl CameraSet {
         self.start(changed.unwrap_or(camera), false).await
     }
 
+    /// Stops a camera that the configuration no longer names, or names otherwise. Its lines and zones stay
+    /// remembered. `false` if it was changed at run time, which wins: it goes on.
+    ///
+    /// # Errors
+    /// There is no such camera.
+    pub async fn stop_configured(&self, id: &CameraId) -> Result<bool, CameraError> {
+        let mut changes = self.changes.lock().await;
+        if changes.remembered.cameras.iter().any(|camera| camera.id == *id) {
+            return Ok(false);
+        }
+        self.end(&mut changes, id).await?;
+        Ok(true)
+    }
+
+    /// Ends a camera; what is remembered of it stays.
+    async fn end(&self, changes: &mut Changes, id: &CameraId) -> Result<(), CameraError> {
+        let known = changes.cameras.remove(id).ok_or(CameraError::NotFound)?;
+        let shown = self.shown().remove(id);
+        if let Some(running) = known.running {
+            running.stop().await;
+        }
+        if let Some(shown) = shown {
+            shown.analyst.set_rules(Rules::default());
+        }
+        self.metrics.forget_camera(id);
+        Ok(())
+    }
+
     async fn remembered(&self) -> Vec<NewCamera> {
         self.changes.lock().await.remembered.cameras.clone()
     }
@@ -268,20 +296,16 @@ impl CameraSet {
 
     async fn stop(&self, id: &CameraId) -> Result<(), CameraError> {
         let mut changes = self.changes.lock().await;
-        let Some(known) = changes.cameras.remove(id) else { return Err(CameraError::NotFound) };
-        let shown = self.shown().remove(id);
+        if !changes.cameras.contains_key(id) {
+            return Err(CameraError::NotFound);
+        }
         let cameras = changes.remembered.cameras.len();
         changes.remembered.cameras.retain(|c| c.id != *id);
         let had_rules = changes.remembered.rules.remove(id.as_str()).is_some();
         let forgets = had_rules || changes.remembered.cameras.len() < cameras;
+        // It ends whether or not that can be written.
         let saved = if forgets { self.save(&changes) } else { Ok(()) };
-        if let Some(running) = known.running {
-            running.stop().await;
-        }
-        if let Some(shown) = shown {
-            shown.analyst.set_rules(Rules::default());
-        }
-        self.metrics.forget_camera(id);
+        self.end(&mut changes, id).await?;
         saved
     }
 

@@ -5,7 +5,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use gakp::api::RIGHTS;
-use gakp::auth::{Gate, Right, Role, TokenFile, tls};
+use gakp::auth::tls::Certificates;
+use gakp::auth::{Gate, Right, Role, TokenFile};
 use serde_json::json;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
@@ -231,33 +232,51 @@ async fn who_is_no_admin_adds_cameras_on_the_network_alone() {
 async fn tls_by_certificate_files() {
     let folder = tempfile::tempdir().unwrap();
     let (cert, key) = (folder.path().join("cert.pem"), folder.path().join("key.pem"));
-    let made = rcgen::generate_simple_self_signed(["localhost".to_owned()]).unwrap();
-    fs::write(&cert, made.cert.pem()).unwrap();
-    fs::write(&key, made.signing_key.serialize_pem()).unwrap();
+    // A certificate of its own at each call.
+    let issue = || {
+        let made = rcgen::generate_simple_self_signed(["localhost".to_owned()]).unwrap();
+        fs::write(&cert, made.cert.pem()).unwrap();
+        fs::write(&key, made.signing_key.serialize_pem()).unwrap();
+        CertificateDer::from_pem_file(&cert).unwrap()
+    };
+    let first = issue();
     for (cert, key, expected) in [
         (&folder.path().join("missing.pem"), &key, "cannot read a certificate"),
         (&key, &key, "there is none in it"),
         (&cert, &cert, "cannot read a private key"),
     ] {
-        let error = tls::load(cert, key).unwrap_err().to_string();
+        let error = Certificates::read(cert, key).unwrap_err().to_string();
         assert!(error.contains(expected), "{error}");
     }
-    let server = Server::start_behind(Gate::open(), Some(tls::load(&cert, &key).unwrap())).await;
-    let mut roots = RootCertStore::empty();
-    roots.add(CertificateDer::from_pem_file(&cert).unwrap()).unwrap();
-    let provider = Arc::new(tokio_rustls::rustls::crypto::ring::default_provider());
-    let client = ClientConfig::builder_with_provider(provider)
-        .with_safe_default_protocol_versions()
-        .unwrap()
-        .with_root_certificates(roots)
-        .with_no_client_auth();
-    let stream = TcpStream::connect(server.addr).await.unwrap();
-    let name = "localhost".try_into().unwrap();
-    let mut stream = TlsConnector::from(Arc::new(client)).connect(name, stream).await.unwrap();
-    stream.write_all(b"GET /healthz HTTP/1.0\r\nHost: localhost\r\n\r\n").await.unwrap();
-    let mut answer = String::new();
-    stream.read_to_string(&mut answer).await.unwrap();
+    let certificates = Certificates::read(&cert, &key).unwrap();
+    let server = Server::start_behind(Gate::open(), Some(certificates.server().unwrap())).await;
+    let ask = async |trusted: &CertificateDer<'static>| -> std::io::Result<String> {
+        let mut roots = RootCertStore::empty();
+        roots.add(trusted.clone()).unwrap();
+        let provider = Arc::new(tokio_rustls::rustls::crypto::ring::default_provider());
+        let client = ClientConfig::builder_with_provider(provider)
+            .with_safe_default_protocol_versions()
+            .unwrap()
+            .with_root_certificates(roots)
+            .with_no_client_auth();
+        let stream = TcpStream::connect(server.addr).await?;
+        let name = "localhost".try_into().unwrap();
+        let mut stream = TlsConnector::from(Arc::new(client)).connect(name, stream).await?;
+        stream.write_all(b"GET /healthz HTTP/1.0\r\nHost: localhost\r\n\r\n").await?;
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer).await?;
+        Ok(answer)
+    };
+    let answer = ask(&first).await.unwrap();
     assert!(answer.starts_with("HTTP/1.0 200"), "{answer}");
+    // Renewed: who trusts the new one alone is let in once it was read. Half a renewal changes nothing.
+    let second = issue();
+    assert!(ask(&second).await.is_err());
+    certificates.read_again().unwrap();
+    assert!(ask(&second).await.is_ok() && ask(&first).await.is_err());
+    fs::write(&key, rcgen::KeyPair::generate().unwrap().serialize_pem()).unwrap();
+    assert!(certificates.read_again().is_err());
+    assert!(ask(&second).await.is_ok());
     // Plain HTTP is no TLS: the connection ends, the service goes on.
     let mut plain = TcpStream::connect(server.addr).await.unwrap();
     plain.write_all(b"GET /healthz HTTP/1.0\r\n\r\n").await.unwrap();

@@ -251,6 +251,7 @@ impl Server {
                 false => vec!["the detector is not loaded".to_owned()],
             }),
             gate: Arc::new(gate),
+            operations: None,
             tls,
         };
         let (stop, stopped) = oneshot::channel();
