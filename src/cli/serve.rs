@@ -17,6 +17,7 @@ use crate::auth::{Gate, TokenFile, tls};
 use crate::config::{Config, TrackerOptions};
 use crate::history::{History, HistoryMetrics, HistorySettings, Pictures};
 use crate::infer::Models;
+use crate::notify::{Notifier, NotifyPlan};
 use crate::pipeline::{CameraSet, Lanes, MAX_CAMERAS, SetConfig, Store, source_spec};
 use crate::publish::{EventHub, Hub, HubConfig};
 use crate::telemetry::Metrics;
@@ -105,11 +106,13 @@ struct Plan {
     snapshots: bool,
     tracker: TrackerOptions,
     models: crate::infer::ModelSettings,
+    notify: NotifyPlan,
 }
 
 impl Plan {
     fn new(args: Args) -> Result<Self> {
-        let config = args.config.as_deref().map(Config::read).transpose()?.unwrap_or_default();
+        let mut config = args.config.as_deref().map(Config::read).transpose()?.unwrap_or_default();
+        let notify = config.take_notify()?;
         let tracker = config.tracker.tuned(args.tuning)?;
         let mut cameras = config.cameras;
         for text in &args.cameras {
@@ -167,6 +170,7 @@ impl Plan {
             snapshots: kept.snapshots,
             tracker,
             models: crate::config::ModelConfig::from(args.models).or(config.models).settings()?,
+            notify,
         })
     }
 }
@@ -175,7 +179,7 @@ async fn serve(plan: Plan) -> Result<()> {
     let mut signals = Signals::listen()?;
     let (stop, stopped) = oneshot::channel();
     let mut service = std::pin::pin!(async {
-        let Service { listener, config, set, history } = start(plan).await?;
+        let Service { listener, config, set, history, notifier } = start(plan).await?;
         let hub = config.hub.clone();
         let served = api::serve(listener, config, async {
             // An error means that nobody can ask for the end any more: that is the end too.
@@ -183,6 +187,7 @@ async fn serve(plan: Plan) -> Result<()> {
         })
         .await;
         hub.close();
+        notifier.stop().await;
         set.shutdown().await;
         if let Some(history) = history {
             history.stop().await;
@@ -211,6 +216,7 @@ struct Service {
     config: ApiConfig,
     set: Arc<CameraSet>,
     history: Option<History>,
+    notifier: Notifier,
 }
 
 /// Loads the models, takes the port, starts the cameras: in this order, so that a mistake leaves
@@ -256,8 +262,10 @@ async fn start(plan: Plan) -> Result<Service> {
     set.start_remembered().await;
     let scheme = if plan.tls.is_some() { "https" } else { "http" };
     tracing::info!("the page is at {scheme}://{address}/");
+    let cameras: Arc<dyn api::Cameras> = set.clone();
+    let notifier = Notifier::start(plan.notify, &cameras, &hub, &events, metrics.registry())?;
     let config = ApiConfig {
-        cameras: set.clone(),
+        cameras,
         hub,
         events,
         history: history.as_ref().map(|history| history.database().clone()),
@@ -267,7 +275,7 @@ async fn start(plan: Plan) -> Result<Service> {
         gate: Arc::new(plan.gate),
         tls: plan.tls,
     };
-    Ok(Service { listener, config, set, history })
+    Ok(Service { listener, config, set, history, notifier })
 }
 
 /// The newest picture of each camera.
