@@ -289,7 +289,7 @@ impl MqttOptions {
 
     fn checked(self, folder: &Path) -> Result<MqttPlan, String> {
         let mut address = Address::parse(self.url.text(), &MQTT).map_err(|e| format!("its url {e}"))?;
-        if address.path.trim_matches('/') != "" {
+        if !address.path.trim_matches('/').is_empty() {
             return Err("its url has a path: write the prefix of the topics as topic = \"...\"".into());
         }
         let file = self.password_file.map(|file| folder.join(file));

@@ -156,7 +156,7 @@ mod tests {
         assert_eq!((address.host.as_str(), address.port, address.tls), ("hooks.example", 443, true));
         assert_eq!(address.path, "/services/T0KEN?key=s3cret");
         let login = Login { user: "user".into(), password: "hunt@er2".into() };
-        assert_eq!(address.login, Some(login));
+        assert!(address.login == Some(login));
         assert_eq!(
             format!("{address} {address:?}"),
             "https://hooks.example:443/... Address(https://hooks.example:443/...)"
