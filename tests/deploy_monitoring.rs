@@ -177,9 +177,8 @@ fn every_query_finds_data() {
     // Nobody is there to be told: what is measured of that is there all the same.
     let config = state.path().join("gakp.toml");
     let gone = refusing.address();
-    let sinks = format!(
-        "[[webhook]]\nname = \"gone\"\nurl = \"http://{gone}/\"\n[mqtt]\nurl = \"mqtt://{gone}\"\n"
-    );
+    let sinks =
+        format!("[[webhook]]\nname = \"gone\"\nurl = \"http://{gone}/\"\n[mqtt]\nurl = \"mqtt://{gone}\"\n");
     std::fs::write(&config, sinks).unwrap();
     let service = Service::start(
         state.path(),

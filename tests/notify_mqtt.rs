@@ -205,3 +205,32 @@ fn a_wrong_password_is_said_and_the_rest_goes_on() {
     let log = service.stop();
     assert!(!log.contains(PASSWORD) && log.contains("NotAuthorized"), "{log}");
 }
+
+#[test]
+fn a_broker_may_speak_tls_to_those_who_trust_it() {
+    let made = rcgen::generate_simple_self_signed(["localhost".to_owned()]).unwrap();
+    let broker = Broker::start_with(|folder| {
+        std::fs::write(folder.join("cert.pem"), made.cert.pem()).unwrap();
+        std::fs::write(folder.join("key.pem"), made.signing_key.serialize_pem()).unwrap();
+        format!("certfile {0}/cert.pem\nkeyfile {0}/key.pem\n", folder.display())
+    });
+    let (Some(broker), Some(_)) = (broker, models()) else { return };
+    let state = tempfile::tempdir().unwrap();
+    std::fs::write(state.path().join("ca.pem"), made.cert.pem()).unwrap();
+    let config = format!(
+        "[mqtt]\nurl = \"mqtts://localhost:{}\"\nuser = \"gakp\"\npassword = \"{PASSWORD}\"\nca_file = \"ca.pem\"\n\
+         [[webhook]]\nname = \"chat\"\nurl = \"http://127.0.0.1:9/T0KEN\"\n",
+        broker.address.port()
+    );
+    let file = state.path().join("gakp.toml");
+    std::fs::write(&file, config).unwrap();
+    let service = Service::start(state.path(), &["--config", file.to_str().unwrap()]);
+    eventually("the connection", || connected(&service).then_some(()));
+    // On the way, the answer about webhooks.
+    let webhooks = service.get("/v1/webhooks").json();
+    let expected = json!({"name": "chat", "url": "http://127.0.0.1:9/...", "signed": false, "delivered": 0,
+        "failed": 0, "pending": 0, "last_error": null, "last_error_time": null});
+    assert_eq!(webhooks, json!({"webhooks": [expected]}));
+    let log = service.stop();
+    assert!(!log.contains(PASSWORD) && !log.contains("T0KEN"), "{log}");
+}

@@ -20,7 +20,7 @@ const VIEW: Right = Right::Role(Role::Viewer);
 const CHANGE: Right = Right::Role(Role::Operator);
 
 /// What each route asks for. One that is not here asks for an admin. `HEAD` asks for what `GET` does.
-pub const RIGHTS: [(&str, &str, Right); 41] = [
+pub const RIGHTS: [(&str, &str, Right); 42] = [
     ("GET", "/v1/cameras", VIEW),
     ("POST", "/v1/cameras", CHANGE),
     ("GET", "/v1/cameras/{id}", VIEW),
@@ -54,6 +54,7 @@ pub const RIGHTS: [(&str, &str, Right); 41] = [
     ("GET", "/v1/history/events", VIEW),
     ("GET", "/v1/history/events.csv", VIEW),
     ("GET", "/v1/history/counts", VIEW),
+    ("GET", "/v1/webhooks", Right::Role(Role::Admin)),
     ("GET", "/v1/session", Right::Nobody),
     ("POST", "/v1/session", Right::Nobody),
     ("DELETE", "/v1/session", Right::Nobody),

@@ -15,6 +15,7 @@
 //! /v1/tracks/stream                the same as Server-Sent Events
 //! /v1/events[/live]                what happened at lines and in zones; a WebSocket of it
 //! /v1/history[/...]                tracks and events that were; counts over time; CSV, MOTChallenge
+//! /v1/webhooks                     how webhooks fare
 //! /v1/openapi.json                all of this for programs
 //! /metrics /healthz /readyz
 //! ```
@@ -62,6 +63,7 @@ pub use socket::KeepAlive;
 
 use crate::auth::Gate;
 use crate::history::Database;
+use crate::notify::WebhookHandle;
 use crate::publish::{EventHub, Hub};
 use socket::{Seats, Sockets};
 use video::Studio;
@@ -83,6 +85,8 @@ pub struct ApiConfig {
     pub events: EventHub,
     /// What was; without it no history is kept.
     pub history: Option<Database>,
+    /// Where events are posted.
+    pub webhooks: Vec<WebhookHandle>,
     /// What `/metrics` shows.
     pub registry: Registry,
     /// What `/readyz` asks.
@@ -100,6 +104,7 @@ struct ApiState {
     hub: Hub,
     events: EventHub,
     history: Option<Database>,
+    webhooks: Arc<[WebhookHandle]>,
     registry: Registry,
     readiness: Readiness,
     gate: Arc<Gate>,
@@ -111,11 +116,24 @@ struct ApiState {
 }
 
 fn router(config: ApiConfig, sockets: Sockets) -> Router {
-    let ApiConfig { cameras, hub, events, history, registry, readiness, gate, tls } = config;
+    let ApiConfig { cameras, hub, events, history, webhooks, registry, readiness, gate, tls } = config;
     let studio = Arc::new(Studio::default());
     let (seats, secure) = (Seats::default(), tls.is_some());
-    let state =
-        ApiState { cameras, hub, events, history, registry, readiness, gate, secure, studio, seats, sockets };
+    let webhooks = webhooks.into();
+    let state = ApiState {
+        cameras,
+        hub,
+        events,
+        history,
+        webhooks,
+        registry,
+        readiness,
+        gate,
+        secure,
+        studio,
+        seats,
+        sockets,
+    };
     Router::new()
         .route("/v1/cameras", get(rest::list).post(rest::add))
         .route("/v1/cameras/{id}", get(rest::get).patch(rest::patch).delete(rest::remove))
@@ -141,6 +159,7 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
         .route("/v1/history/events", get(history::events))
         .route("/v1/history/events.csv", get(history::events_csv))
         .route("/v1/history/counts", get(history::counts))
+        .route("/v1/webhooks", get(rest::webhooks))
         .route("/v1/openapi.json", get(openapi::document))
         .route("/metrics", get(rest::metrics))
         .route("/healthz", get(rest::healthz))

@@ -269,6 +269,7 @@ async fn start(plan: Plan) -> Result<Service> {
         hub,
         events,
         history: history.as_ref().map(|history| history.database().clone()),
+        webhooks: notifier.webhooks(),
         registry: metrics.registry().clone(),
         // Models are warm before the port is bound: who can ask finds the service ready.
         readiness: Arc::new(Vec::new),

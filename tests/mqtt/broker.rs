@@ -70,6 +70,11 @@ impl Listener {
 impl Broker {
     /// Starts it on a free port; `None` where mosquitto is missing.
     pub fn start() -> Option<Self> {
+        Self::start_with(|_| String::new())
+    }
+
+    /// Starts it with more settings of its listener; they may name files that are written to the folder.
+    pub fn start_with(settings: impl FnOnce(&Path) -> String) -> Option<Self> {
         let (server, passwords) = (program("mosquitto")?, program("mosquitto_passwd")?);
         for client in ["mosquitto_sub", "mosquitto_pub"] {
             program(client)?;
@@ -83,8 +88,9 @@ impl Broker {
         std::fs::set_permissions(&file, PermissionsExt::from_mode(0o644)).unwrap();
         std::fs::set_permissions(folder.path(), PermissionsExt::from_mode(0o755)).unwrap();
         let config = format!(
-            "listener {} 127.0.0.1\nallow_anonymous false\npassword_file {}\npersistence false\n",
+            "listener {} 127.0.0.1\n{}allow_anonymous false\npassword_file {}\npersistence false\n",
             address.port(),
+            settings(folder.path()),
             file.display()
         );
         std::fs::write(folder.path().join("mosquitto.conf"), config).unwrap();
