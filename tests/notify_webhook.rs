@@ -242,6 +242,30 @@ async fn one_that_is_down_for_good_loses_only_its_own() {
     assert!(running.metrics().contains("gakp_webhook_up{webhook=\"there\"} 1"));
 }
 
+/// More at once than the hub keeps for a listener: it says how many it missed, and they are counted.
+#[tokio::test]
+async fn every_event_of_a_flood_is_accounted_for() {
+    let (router, posts) = receiver(ok);
+    let (hanging, _) = receiver(|_| [("x-hang", "")].into_response());
+    let (address, silent) = (listen(router).await, listen(hanging).await);
+    let mut running = Running::start(&format!(
+        "[[webhook]]\nname = \"there\"\nurl = \"http://{address}/hooks/a\"\nqueue = 2000\n\
+         [[webhook]]\nname = \"silent\"\nurl = \"http://{silent}/hooks/a\"\nqueue = 100\n"
+    ));
+    running.publish("gate", 3000);
+    let accounted = |running: &Running, name: &str| {
+        let status = running.status(name);
+        status.delivered + status.failed + status.pending as u64
+    };
+    eventually("the rest", || running.status("there").delivered == 1024).await;
+    eventually("all of them", || accounted(&running, "silent") == 3000).await;
+    assert_eq!((running.outcome("there", "dropped"), accounted(&running, "there")), (1976, 3000));
+    assert!((100..=101).contains(&running.status("silent").pending), "{:?}", running.status("silent"));
+    let expected: Vec<_> = (1977..=3000).map(|n| format!("line-{n}")).collect();
+    assert_eq!(lines(&posts), expected);
+    assert!(running.metrics().contains("gakp_webhook_queue_length{webhook=\"there\"} 0"));
+}
+
 #[tokio::test]
 async fn only_what_is_asked_for_is_posted() {
     let (router, posts) = receiver(ok);

@@ -12,6 +12,9 @@ use crate::analytics::{LineCount, ZoneCount};
 use crate::api::{CameraState, CameraStatus, Cameras};
 use crate::types::{CameraId, is_name};
 
+/// Topics that the broker may claim to keep: more than a service has, and a bound to what a broker can make us remember.
+const MOST_TOPICS: usize = 50_000;
+
 /// What is retained under a topic now.
 pub(super) type Retained = BTreeMap<String, Bytes>;
 
@@ -200,6 +203,9 @@ impl Ledger {
 
     /// That the broker may keep something there.
     pub fn suspect(&mut self, topic: String, every: Duration) {
+        if self.sent.len() >= MOST_TOPICS {
+            return;
+        }
         let at = Instant::now().checked_sub(every).unwrap_or_else(Instant::now);
         self.sent.entry(topic).or_insert(Sent { message: None, at });
     }
