@@ -15,7 +15,7 @@ use tokio_rustls::rustls::pki_types::{CertificateDer, ServerName};
 use tokio_rustls::rustls::{self, ClientConfig, RootCertStore};
 
 /// A scheme that an address may have.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, PartialEq)]
 pub(super) struct Scheme {
     pub name: &'static str,
     pub tls: bool,
@@ -32,7 +32,7 @@ pub(super) struct Login {
 /// A URL taken apart. `Display` and `Debug` show scheme, host and port: a path or a query may be a token.
 #[derive(Clone, PartialEq)]
 pub(super) struct Address {
-    scheme: &'static str,
+    scheme: Scheme,
     pub tls: bool,
     pub host: String,
     pub port: u16,
@@ -73,12 +73,12 @@ impl Address {
         }
         let path = uri.path_and_query().map_or("/", |path| path.as_str()).to_owned();
         let port = uri.port_u16().unwrap_or(scheme.port);
-        Ok(Self { scheme: scheme.name, tls: scheme.tls, host, port, login, path })
+        Ok(Self { scheme: *scheme, tls: scheme.tls, host, port, login, path })
     }
 
-    /// `host:port`.
+    /// `host:port`, or the host alone where the port is the scheme's own.
     pub fn authority(&self) -> String {
-        format!("{}:{}", self.host, self.port)
+        if self.port == self.scheme.port { self.host.clone() } else { format!("{}:{}", self.host, self.port) }
     }
 
     /// Connects; over TLS where the scheme says so.
@@ -96,7 +96,7 @@ impl Address {
 impl fmt::Display for Address {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let more = if self.path == "/" { "" } else { "/..." };
-        write!(f, "{}://{}:{}{more}", self.scheme, self.host, self.port)
+        write!(f, "{}://{}{more}", self.scheme.name, self.authority())
     }
 }
 
@@ -159,7 +159,7 @@ mod tests {
         assert!(address.login == Some(login));
         assert_eq!(
             format!("{address} {address:?}"),
-            "https://hooks.example:443/... Address(https://hooks.example:443/...)"
+            "https://hooks.example/... Address(https://hooks.example/...)"
         );
         let plain = Address::parse("http://[::1]:8080", &HTTP).unwrap();
         assert_eq!((plain.to_string().as_str(), plain.path.as_str()), ("http://[::1]:8080", "/"));
