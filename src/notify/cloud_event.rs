@@ -61,17 +61,12 @@ pub(super) fn signature(key: &ring::hmac::Key, id: &str, timestamp: i64, body: &
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::types::CameraId;
+    use crate::notify::queue::tests::event;
 
     #[test]
     fn a_body_is_exactly_this() {
         let json = r#"{"id":"1-1","type":"line.crossed","camera":"gate","time":"2026-01-02T03:04:05.000000006Z","line":"door","place":[0.5,1.0]}"#;
-        let event = NumberedEvent {
-            id: "1-1".into(),
-            kind: "line.crossed",
-            camera: CameraId::new("gate").unwrap(),
-            json: json.into(),
-        };
+        let event = NumberedEvent { id: "1-1".into(), kind: "line.crossed", json: json.into(), ..event(1) };
         let expected = format!(
             "{}{json}}}",
             concat!(

@@ -111,21 +111,31 @@ impl Inner {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
-    use crate::types::CameraId;
+    use crate::analytics::{Direction, Happening, Point, RuleId, What};
+    use crate::types::{CameraId, Epoch};
 
-    fn event(n: u32) -> Arc<NumberedEvent> {
-        let camera = CameraId::new("gate").unwrap();
-        Arc::new(NumberedEvent { id: n.to_string(), kind: "zone.left", camera, json: "{}".into() })
+    /// A crossing of camera `gate`.
+    pub(crate) fn event(n: u32) -> NumberedEvent {
+        let what = What::Crossed { line: RuleId::new("door").unwrap(), direction: Direction::In };
+        NumberedEvent {
+            id: n.to_string(),
+            kind: "line.crossed",
+            camera: CameraId::new("gate").unwrap(),
+            epoch: Epoch(1),
+            unix_ns: 0,
+            happening: Happening { track: None, place: Point { x: 0.5, y: 0.5 }, what },
+            json: "{}".into(),
+        }
     }
 
     #[tokio::test]
     async fn the_oldest_goes_when_it_is_full_but_not_the_one_under_way() {
         let queue = Queue::new(2);
-        assert!(!queue.push(event(1)));
+        assert!(!queue.push(event(1).into()));
         assert_eq!(queue.next().await.unwrap().event.id, "1");
-        assert!(!queue.push(event(2)) && !queue.push(event(3)) && queue.push(event(4)));
+        assert!(!queue.push(event(2).into()) && !queue.push(event(3).into()) && queue.push(event(4).into()));
         assert_eq!((queue.next().await.unwrap().event.id.as_str(), queue.len()), ("1", 3));
         queue.done();
         queue.close();
@@ -140,7 +150,7 @@ mod tests {
     async fn what_has_waited_too_long_goes() {
         let queue = Queue::new(5);
         for n in 1..=3 {
-            queue.push(event(n));
+            queue.push(event(n).into());
         }
         queue.next().await.unwrap();
         assert_eq!((queue.expire(Duration::from_secs(60)), queue.len()), (0, 3));
