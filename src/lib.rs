@@ -47,6 +47,8 @@ pub mod auth;
 #[cfg(feature = "service")]
 pub mod history;
 #[cfg(feature = "service")]
+pub mod notify;
+#[cfg(feature = "service")]
 pub mod publish;
 
 pub mod mot;

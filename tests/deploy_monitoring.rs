@@ -174,9 +174,17 @@ fn every_query_finds_data() {
     let made =
         run_to_end(&["token", "create", "prometheus", "--state-dir", state.path().to_str().unwrap()], &[]);
     assert!(made.status.success(), "{made:?}");
+    // Nobody is there to be told: what is measured of that is there all the same.
+    let config = state.path().join("gakp.toml");
+    let gone = refusing.address();
+    let sinks =
+        format!("[[webhook]]\nname = \"gone\"\nurl = \"http://{gone}/\"\n[mqtt]\nurl = \"mqtt://{gone}\"\n");
+    std::fs::write(&config, sinks).unwrap();
     let service = Service::start(
         state.path(),
         &[
+            "--config",
+            config.to_str().unwrap(),
             "--admin-token-file",
             secret.to_str().unwrap(),
             "--loop",

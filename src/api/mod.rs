@@ -15,6 +15,7 @@
 //! /v1/tracks/stream                the same as Server-Sent Events
 //! /v1/events[/live]                what happened at lines and in zones; a WebSocket of it
 //! /v1/history[/...]                tracks and events that were; counts over time; CSV, MOTChallenge
+//! /v1/webhooks                     how webhooks fare
 //! /v1/openapi.json                all of this for programs
 //! /v1/log /v1/reload               what is logged; reading the configuration again
 //! /metrics /healthz /readyz
@@ -65,6 +66,7 @@ pub use socket::KeepAlive;
 
 use crate::auth::Gate;
 use crate::history::Database;
+use crate::notify::WebhookHandle;
 use crate::publish::{EventHub, Hub};
 use socket::{Seats, Sockets};
 use video::Studio;
@@ -86,6 +88,8 @@ pub struct ApiConfig {
     pub events: EventHub,
     /// What was; without it no history is kept.
     pub history: Option<Database>,
+    /// Where events are posted.
+    pub webhooks: Vec<WebhookHandle>,
     /// What `/metrics` shows.
     pub registry: Registry,
     /// What `/readyz` asks.
@@ -105,6 +109,7 @@ struct ApiState {
     hub: Hub,
     events: EventHub,
     history: Option<Database>,
+    webhooks: Arc<[WebhookHandle]>,
     registry: Registry,
     readiness: Readiness,
     gate: Arc<Gate>,
@@ -117,14 +122,17 @@ struct ApiState {
 }
 
 fn router(config: ApiConfig, sockets: Sockets) -> Router {
-    let ApiConfig { cameras, hub, events, history, registry, readiness, gate, operations, tls } = config;
+    let ApiConfig { cameras, hub, events, history, webhooks, registry, readiness, gate, operations, tls } =
+        config;
     let studio = Arc::new(Studio::default());
     let (seats, secure) = (Seats::default(), tls.is_some());
+    let webhooks = webhooks.into();
     let state = ApiState {
         cameras,
         hub,
         events,
         history,
+        webhooks,
         registry,
         readiness,
         gate,
@@ -159,6 +167,7 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
         .route("/v1/history/events", get(history::events))
         .route("/v1/history/events.csv", get(history::events_csv))
         .route("/v1/history/counts", get(history::counts))
+        .route("/v1/webhooks", get(rest::webhooks))
         .route("/v1/openapi.json", get(openapi::document))
         .route("/v1/log", get(operations::log).put(operations::set_log))
         .route("/v1/reload", post(operations::reload))

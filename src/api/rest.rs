@@ -1,4 +1,4 @@
-//! `/v1/cameras`, health, metrics.
+//! `/v1/cameras`, `/v1/webhooks`, health, metrics.
 
 use axum::extract::State;
 use axum::http::{Method, StatusCode, Uri, header};
@@ -11,6 +11,7 @@ use super::extract::{JsonBody, Path, camera_id};
 use super::problem::Problem;
 use super::{ApiState, CameraPatch, CameraStatus, NewCamera, ssrf};
 use crate::auth::Identity;
+use crate::notify::{WebhookHandle, WebhookStatus};
 
 #[derive(Serialize)]
 pub(super) struct CameraList {
@@ -19,6 +20,15 @@ pub(super) struct CameraList {
 
 pub(super) async fn list(State(state): State<ApiState>) -> Json<CameraList> {
     Json(CameraList { cameras: state.cameras.list() })
+}
+
+#[derive(Serialize)]
+pub(super) struct WebhookList {
+    webhooks: Vec<WebhookStatus>,
+}
+
+pub(super) async fn webhooks(State(state): State<ApiState>) -> Json<WebhookList> {
+    Json(WebhookList { webhooks: state.webhooks.iter().map(WebhookHandle::status).collect() })
 }
 
 pub(super) async fn get(

@@ -18,6 +18,7 @@ use crate::auth::{Gate, TokenFile};
 use crate::config::{Config, TrackerOptions};
 use crate::history::{History, HistoryMetrics, HistorySettings, Pictures};
 use crate::infer::Models;
+use crate::notify::{Notifier, NotifyPlan};
 use crate::pipeline::{CameraSet, Lanes, MAX_CAMERAS, SetConfig, Store, source_spec};
 use crate::publish::{EventHub, Hub, HubConfig};
 use crate::telemetry::Metrics;
@@ -109,6 +110,7 @@ pub(super) struct Plan {
     snapshots: bool,
     pub(super) tracker: TrackerOptions,
     pub(super) models: crate::infer::ModelSettings,
+    notify: NotifyPlan,
 }
 
 impl Args {
@@ -127,7 +129,8 @@ impl Plan {
     /// # Errors
     /// The first that is wrong.
     pub(super) fn new(args: Args) -> Result<Self> {
-        let (given, config) = (args.clone(), args.configuration()?);
+        let (given, mut config) = (args.clone(), args.configuration()?);
+        let notify = config.take_notify()?;
         let tracker = config.tracker.tuned(args.tuning)?;
         let mut cameras = config.cameras;
         for text in &args.cameras {
@@ -187,6 +190,7 @@ impl Plan {
             snapshots: kept.snapshots,
             tracker,
             models: crate::config::ModelConfig::from(args.models).or(config.models).settings()?,
+            notify,
         })
     }
 }
@@ -195,7 +199,7 @@ async fn serve(plan: Plan) -> Result<()> {
     let mut signals = Signals::listen()?;
     let (stop, stopped) = oneshot::channel();
     let mut service = std::pin::pin!(async {
-        let Service { listener, config, set, history } = start(plan).await?;
+        let Service { listener, config, set, history, notifier } = start(plan).await?;
         let hub = config.hub.clone();
         let served = api::serve(listener, config, async {
             // An error means that nobody can ask for the end any more: that is the end too.
@@ -203,6 +207,7 @@ async fn serve(plan: Plan) -> Result<()> {
         })
         .await;
         hub.close();
+        notifier.stop().await;
         set.shutdown().await;
         if let Some(history) = history {
             history.stop().await;
@@ -231,6 +236,7 @@ struct Service {
     config: ApiConfig,
     set: Arc<CameraSet>,
     history: Option<History>,
+    notifier: Notifier,
 }
 
 /// Loads the models, takes the port, starts the cameras: in this order, so that a mistake leaves
@@ -280,11 +286,14 @@ async fn start(plan: Plan) -> Result<Service> {
     tokio::spawn(signals::on_hangup(reloader.clone())?);
     let scheme = if tls.is_some() { "https" } else { "http" };
     tracing::info!("the page is at {scheme}://{address}/");
+    let cameras: Arc<dyn api::Cameras> = set.clone();
+    let notifier = Notifier::start(plan.notify, &cameras, &hub, &events, metrics.registry())?;
     let config = ApiConfig {
-        cameras: set.clone(),
+        cameras,
         hub,
         events,
         history: history.as_ref().map(|history| history.database().clone()),
+        webhooks: notifier.webhooks(),
         registry: metrics.registry().clone(),
         // Models are warm before the port is bound: who can ask finds the service ready.
         readiness: Arc::new(Vec::new),
@@ -292,7 +301,7 @@ async fn start(plan: Plan) -> Result<Service> {
         operations: Some(reloader),
         tls,
     };
-    Ok(Service { listener, config, set, history })
+    Ok(Service { listener, config, set, history, notifier })
 }
 
 /// The newest picture of each camera.

@@ -245,6 +245,7 @@ impl Server {
             hub: hub.clone(),
             events: events.clone(),
             history: None,
+            webhooks: vec![],
             registry,
             readiness: Arc::new(move || match answer.load(Ordering::SeqCst) {
                 true => vec![],

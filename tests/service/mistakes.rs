@@ -124,6 +124,11 @@ fn wrong_settings_are_told_before_anything_starts() {
         ("[tracker]\nhigh_score = 7", vec!["gakp.toml", "tracker.high_score = 7"]),
         ("max_cameras = \"many\"", vec!["gakp.toml", "line 1", "\"many\""]),
         ("this is no TOML", vec!["gakp.toml", "line 1"]),
+        ("[[webhook]]\nurl = \"ftp://u:hunter2@h/\"", vec!["webhook \"webhook-1\"", "http:// or https://"]),
+        (
+            "[mqtt]\nurl = \"mqtt://h\"\nuser = \"u\"\npassword_file = \"none\"",
+            vec!["mqtt: cannot read password_file", "none"],
+        ),
     ] {
         service.check(&["--config", &config(text)], &[], &expected);
     }
