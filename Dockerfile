@@ -18,12 +18,14 @@ ARG RUST=rust:1.94-bookworm
 FROM ${RUST} AS build
 SHELL ["/bin/bash", "-euo", "pipefail", "-c"]
 WORKDIR /gakp
-# The set-up in the order of how seldom its inputs change: packages, models, code.
+# The set-up in the order of how seldom its inputs change: packages, models, page, code.
 COPY Cargo.toml ./
 COPY deploy/setup.sh deploy/
 RUN bash deploy/setup.sh packages
 COPY models models
 RUN bash deploy/setup.sh models && rm -rf models/cache/nanodet models/build
+COPY web web
+RUN bash deploy/setup.sh page && rm -rf web/node_modules
 COPY . .
 RUN --mount=type=cache,target=/usr/local/cargo/registry \
     --mount=type=cache,target=/gakp/target \

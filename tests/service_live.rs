@@ -5,8 +5,6 @@
 mod account;
 #[path = "service/analytics.rs"]
 mod analytics;
-#[path = "browser/cdp.rs"]
-mod cdp;
 #[path = "service/ending.rs"]
 mod ending;
 #[path = "service/failures.rs"]
@@ -15,6 +13,8 @@ mod failures;
 mod history;
 #[path = "service/page.rs"]
 mod page;
+#[path = "browser/playwright.rs"]
+mod playwright;
 #[path = "service/reload.rs"]
 mod reload;
 #[path = "service/rest.rs"]

@@ -1,4 +1,5 @@
-//! The web page at `/`, embedded: plain HTML, CSS and ES modules, nothing from elsewhere.
+//! The web page at `/`, embedded: what npm has built of `web/`, nothing from elsewhere. A binary that was compiled without
+//! it shows how to build it.
 
 use axum::Router;
 use axum::http::header;
@@ -9,28 +10,24 @@ use axum::routing::get;
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; \
                       connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
-const ASSETS: [(&str, &str, &str); 5] = [
-    ("/", "text/html; charset=utf-8", include_str!("page/index.html")),
-    ("/page/style.css", "text/css; charset=utf-8", include_str!("page/style.css")),
-    ("/page/app.js", "text/javascript; charset=utf-8", include_str!("page/app.js")),
-    ("/page/view.js", "text/javascript; charset=utf-8", include_str!("page/view.js")),
-    ("/page/draw.js", "text/javascript; charset=utf-8", include_str!("page/draw.js")),
-];
+/// Path, media type, content: written by build.rs.
+const FILES: &[(&str, &str, &[u8])] = include!(concat!(env!("OUT_DIR"), "/page.rs"));
 
 pub(super) fn routes<S: Clone + Send + Sync + 'static>() -> Router<S> {
-    ASSETS.into_iter().fold(Router::new(), |router, (path, media_type, text)| {
-        router.route(path, get(move || async move { asset(media_type, text) }))
+    FILES.iter().fold(Router::new(), |router, &(path, media_type, bytes)| {
+        router.route(path, get(move || async move { file(path, media_type, bytes) }))
     })
 }
 
-fn asset(media_type: &'static str, text: &'static str) -> impl IntoResponse {
+fn file(path: &str, media_type: &'static str, bytes: &'static [u8]) -> impl IntoResponse {
+    // The names of what the page loads change with its content; a newer binary brings a newer page.
+    let cache = if path == "/" { "no-cache" } else { "public, max-age=31536000, immutable" };
     let headers = [
         (header::CONTENT_TYPE, media_type),
         (header::CONTENT_SECURITY_POLICY, POLICY),
         (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
         (header::REFERRER_POLICY, "no-referrer"),
-        // A newer binary brings a newer page.
-        (header::CACHE_CONTROL, "no-cache"),
+        (header::CACHE_CONTROL, cache),
     ];
-    (headers, text)
+    (headers, bytes)
 }

@@ -2,7 +2,7 @@
 //!
 //! A confirmed track has a solid box, its id on a plate and a trail of where it stood (the middle of
 //! its box's lower edge) in the last seconds; a lost one a dashed box and its id; a tentative one a
-//! thin dashed box. A track keeps its colour, here and on the web page (`src/api/page/draw.js`).
+//! thin dashed box. A track keeps its colour, here and on the web page (`web/src/live/draw.ts`).
 
 use std::collections::{BTreeMap, VecDeque};
 

@@ -1,0 +1,88 @@
+import { useSignal } from "@preact/signals";
+import { ask, cameraPath, words, type Camera } from "../api";
+import { refresh } from "../state";
+import { Dialog } from "../ui/Dialog";
+import { CameraFields, type Fields } from "./CameraForm";
+
+/** Changes where a camera is. The password of its address is not shown, so an empty field leaves it as it is. */
+export function EditCamera({ camera, close }: { camera: Camera; close: () => void }) {
+  const fields = useSignal<Fields>({ id: camera.id, url: "", transport: "", looped: true });
+  const error = useSignal("");
+  const busy = useSignal(false);
+  const touched = useSignal(false);
+  const save = async () => {
+    busy.value = true;
+    error.value = "";
+    const { url, transport, looped } = fields.value;
+    const body = { ...(url.trim() && { url: url.trim() }), ...(transport && { transport }), ...(touched.value && { loop: looped }) };
+    try {
+      if (Object.keys(body).length) await ask(cameraPath(camera.id), "PATCH", body);
+      refresh();
+      close();
+    } catch (problem) {
+      error.value = words(problem);
+    } finally {
+      busy.value = false;
+    }
+  };
+  return (
+    <Dialog title={`Edit ${camera.id}`} close={close}>
+      <form
+        onSubmit={(event) => {
+          event.preventDefault();
+          void save();
+        }}
+        onChange={(event) => {
+          if ((event.target as HTMLInputElement).name === "loop") touched.value = true;
+        }}
+      >
+        <CameraFields fields={fields} current={camera.url} />
+        <p class="quiet">The connection is made anew. Lines, zones and their counts stay; people in view get new numbers.</p>
+        <p role="alert" class="bad">
+          {error.value}
+        </p>
+        <div class="row">
+          <button type="submit" class="main" disabled={busy.value}>
+            Save
+          </button>
+          <button type="button" onClick={close}>
+            Cancel
+          </button>
+        </div>
+      </form>
+    </Dialog>
+  );
+}
+
+export function DeleteCamera(props: { camera: Camera; close: () => void; gone: () => void }) {
+  const { camera, close, gone } = props;
+  const error = useSignal("");
+  const busy = useSignal(false);
+  const remove = async () => {
+    busy.value = true;
+    try {
+      await ask(cameraPath(camera.id), "DELETE");
+      close();
+      gone();
+    } catch (problem) {
+      error.value = words(problem);
+      busy.value = false;
+    }
+  };
+  return (
+    <Dialog title={`Delete ${camera.id}?`} close={close}>
+      <p>The camera, its lines and zones and their counts are forgotten.</p>
+      <p role="alert" class="bad">
+        {error.value}
+      </p>
+      <div class="row">
+        <button type="button" class="danger" disabled={busy.value} onClick={() => void remove()}>
+          Delete the camera
+        </button>
+        <button type="button" autofocus onClick={close}>
+          Keep it
+        </button>
+      </div>
+    </Dialog>
+  );
+}
