@@ -105,10 +105,10 @@ fn wrong_settings_are_told_before_anything_starts() {
         (vec!["--admin-token-file", &short], vec!["32 or more visible ASCII characters"]),
         (vec!["--no-such-flag"], vec!["--no-such-flag"]),
         (vec!["--config", "nowhere.toml"], vec!["configuration nowhere.toml", "No such file"]),
-        (vec!["--log", "loud"], vec!["--log \"loud\"", "error, warn, info, debug, trace"]),
+        (vec!["--log", "loud"], vec!["--log", "log level \"loud\"", "error, warn, info, debug, trace"]),
         (
             vec!["--log", "info,gakp=loud"],
-            vec!["--log \"info,gakp=loud\"", "error, warn, info, debug or trace"],
+            vec!["--log", "log level \"info,gakp=loud\"", "error, warn, info, debug or trace"],
         ),
     ] {
         service.check(&args, &[], &expected);
