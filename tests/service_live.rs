@@ -5,6 +5,8 @@
 mod account;
 #[path = "service/analytics.rs"]
 mod analytics;
+#[path = "service/clients.rs"]
+mod clients;
 #[path = "service/ending.rs"]
 mod ending;
 #[path = "service/failures.rs"]
