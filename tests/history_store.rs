@@ -2,8 +2,11 @@
 #![cfg(feature = "service")]
 
 use gakp::analytics::{Direction, Happening, Point, RuleId, What};
-use gakp::history::{Cursor, Database, HistoryError, Place, Recorder, Snapshot, TrackKey, Wanted, at};
-use gakp::publish::{EventFilter, EventHub, Heard};
+use gakp::history::{
+    Cursor, Database, History, HistoryError, HistoryMetrics, HistorySettings, Place, Recorder, Snapshot,
+    TrackKey, Wanted, at,
+};
+use gakp::publish::{EventFilter, EventHub, Heard, Hub, HubConfig};
 use gakp::types::{
     BBox, CameraId, CaptureTime, ClassId, Clock, Epoch, FrameTracks, MediaTime, TrackId, TrackReport,
     TrackState,
@@ -199,6 +202,93 @@ async fn every_answer_is_right(place: Place) {
     assert_eq!(names(&all).await, expect(&everything[..2]));
     assert_eq!(database.snapshot(&key("hall", 1, 1)).await.unwrap(), None);
     database.close().await;
+}
+
+/// What a kind of event leaves out is NULL; a statement that the database keeps must take it both ways.
+async fn every_kind_of_event_is_taken_in_any_order(place: Place) {
+    let database = Database::new(&place).unwrap();
+    database.prepare().await.unwrap();
+    let (door, queue) = (RuleId::new("door").unwrap(), RuleId::new("queue").unwrap());
+    let kinds = [
+        What::Crossed { line: door, direction: Direction::In },
+        What::Left { zone: queue.clone(), dwell: 1.5 },
+        What::Crowded { zone: queue.clone(), occupancy: 9 },
+        What::Loitering { zone: queue.clone(), dwell: 2.5 },
+        What::Entered { zone: queue },
+    ];
+    let classes = ["person".to_owned()];
+    let hub = EventHub::new(classes.clone().into());
+    let mut events = hub.listen(EventFilter::default());
+    let mut told = 0;
+    for first in 0..kinds.len() {
+        for second in 0..kinds.len() {
+            for kind in [first, second] {
+                let what = kinds[kind].clone();
+                let track = (!matches!(what, What::Crowded { .. })).then_some((TrackId(1), ClassId(0)));
+                let happening = Happening { track, place: Point { x: 0.5, y: 0.5 }, what };
+                hub.publish(&frame("gate", 1, SECOND, told), &happening);
+                told += 1;
+                let Some(Heard::Event(event)) = events.next().await else { panic!("an event") };
+                let mut recorder = Recorder::default();
+                recorder.event(event);
+                database.write(&recorder.take(), &classes).await.unwrap();
+            }
+        }
+    }
+    assert_eq!(database.totals().await.unwrap().events, i64::try_from(told).unwrap());
+    let left = Wanted { kind: Some("zone.left".into()), ..Wanted::default() };
+    assert_eq!(database.events(&left, None, 100).await.unwrap().0.len(), 2 * kinds.len());
+    database.close().await;
+}
+
+#[tokio::test]
+async fn sqlite_takes_every_kind_of_event() {
+    let folder = tempfile::tempdir().unwrap();
+    every_kind_of_event_is_taken_in_any_order(Place::Sqlite(folder.path().join("h.sqlite"))).await;
+}
+
+#[tokio::test]
+async fn postgres_takes_every_kind_of_event() {
+    let Some(server) = server::Postgres::start() else { return };
+    every_kind_of_event_is_taken_in_any_order(Place::Postgres(server.url())).await;
+}
+
+/// PostgreSQL takes no NUL in a text, whoever has named a class so.
+#[tokio::test]
+async fn a_row_that_is_refused_keeps_no_other_out() {
+    let Some(server) = server::Postgres::start() else { return };
+    let hub = Hub::new(HubConfig::default(), ["person".to_owned(), "per\0son".to_owned()].into());
+    let events = EventHub::new(hub.classes().clone());
+    let metrics = HistoryMetrics::new(&prometheus::Registry::new()).unwrap();
+    let settings =
+        HistorySettings { place: Place::Postgres(server.url()), keep: None, pictures: None, max_bytes: None };
+    let history = History::start(settings, &hub, &events, metrics.clone()).await.unwrap();
+    for index in 0..FRAMES {
+        let mut report = frame("gate", 1, SECOND, index);
+        for track in report.tracks.iter_mut().filter(|track| track.id == TrackId(2)) {
+            track.class = ClassId(1);
+        }
+        hub.publish(report.clone().into());
+        if let Some(happening) = happening(index) {
+            events.publish(&report, &happening);
+        }
+    }
+    hub.close();
+    drop(events);
+    let database = history.database().clone();
+    tokio::time::timeout(std::time::Duration::from_secs(20), async {
+        while metrics.dropped.get() == 0 || metrics.pending.get() > 0 {
+            tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+        }
+    })
+    .await
+    .expect("a row is refused, and nothing waits");
+    let (tracks, _) = database.tracks(&Wanted::default(), None, 10).await.unwrap();
+    let ids: Vec<_> = tracks.iter().map(|track| track.key.id.0).collect();
+    assert_eq!(ids, [1], "the other track");
+    assert_eq!(database.totals().await.unwrap().events, 4);
+    assert_eq!(metrics.up.get(), 1);
+    history.stop().await;
 }
 
 #[tokio::test]

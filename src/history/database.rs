@@ -16,6 +16,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use sqlx::any::{AnyArguments, AnyConnectOptions, AnyPoolOptions, AnyRow};
+use sqlx::error::ErrorKind;
 use sqlx::query::Query;
 use sqlx::{Any, AnyConnection, AnyPool, AssertSqlSafe, ConnectOptions, Executor, Row};
 
@@ -64,6 +65,21 @@ pub enum HistoryError {
         "the history is of version {0}, this program knows {VERSION}: use the newer program, or another database"
     )]
     Newer(i64),
+}
+
+impl HistoryError {
+    /// Whether the database refuses what was to be written, so that the same will be refused again.
+    pub(super) fn is_refusal(&self) -> bool {
+        match self {
+            Self::Database(sqlx::Error::Encode(_)) => true,
+            Self::Database(sqlx::Error::Database(error)) => {
+                // Class 22 of SQLSTATE: data exception.
+                let is_data = error.code().is_some_and(|code| code.len() == 5 && code.starts_with("22"));
+                is_data || !matches!(error.kind(), ErrorKind::Other)
+            }
+            _ => false,
+        }
+    }
 }
 
 /// Version of the tables.
@@ -372,6 +388,9 @@ fn event<'q>(query: Bound<'q>, event: &Arc<NumberedEvent>) -> Bound<'q> {
         }
     }
     query
+        // The driver sends a NULL double as a single (sqlx issue 4284): a statement that it keeps would then refuse
+        // every double.
+        .persistent(false)
         .bind(event.id.clone())
         .bind(event.camera.as_str().to_owned())
         .bind(event.kind.to_owned())

@@ -7,7 +7,7 @@ use prometheus::{IntCounter, IntGauge, Registry};
 pub struct HistoryMetrics {
     /// Rows written.
     pub written: IntCounter,
-    /// Rows lost because the database was away for too long.
+    /// Rows lost: the database was away for too long, or refused them.
     pub dropped: IntCounter,
     /// Reports of tracks that were not recorded because the collector lagged.
     pub missed_reports: IntCounter,
@@ -43,7 +43,7 @@ impl HistoryMetrics {
             written: counter("gakp_history_rows_written_total", "Rows written to the history.")?,
             dropped: counter(
                 "gakp_history_rows_dropped_total",
-                "Rows of the history lost because its database was away for too long.",
+                "Rows of the history lost: its database was away for too long, or refused them.",
             )?,
             missed_reports: counter(
                 "gakp_history_reports_missed_total",

@@ -16,6 +16,7 @@ mod path;
 mod query;
 mod recorder;
 
+use std::mem::take;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -155,14 +156,15 @@ async fn collect(
     recorder: Arc<Mutex<Recorder>>,
     metrics: HistoryMetrics,
 ) {
+    let mut happens = true;
     loop {
         tokio::select! {
             // First, or an event of the last frame could be lost with the hub.
             biased;
-            event = events.next() => match event {
+            event = events.next(), if happens => match event {
                 Some(Heard::Event(event)) => lock(&recorder).event(event),
                 Some(Heard::Missed(missed)) => metrics.missed_events.inc_by(missed),
-                None => return,
+                None => happens = false,
             },
             event = tracks.next() => match event {
                 Some(Event::Tracks(report)) => lock(&recorder).frame(&report.tracks),
@@ -237,15 +239,45 @@ impl Writer {
         match written {
             Ok(()) => {
                 self.metrics.written.inc_by(self.pending.len() as u64);
-                self.metrics.up.set(1);
                 self.pending = Batch::default();
-                if self.told.take().is_some() {
-                    tracing::info!("the history's database is there again");
-                }
+                self.works();
             }
+            Err(error) if error.is_refusal() => self.write_singly().await,
             Err(error) => self.failed(&error),
         }
         self.metrics.pending.set(self.pending.len() as i64);
+    }
+
+    /// One row that the database refuses must not keep the others out.
+    async fn write_singly(&mut self) {
+        let mut rows = take(&mut self.pending).into_rows();
+        let (mut refused, mut why) = (0, None);
+        while let Some(row) = rows.next() {
+            match self.database.write(&row, &self.classes).await {
+                Ok(()) => self.metrics.written.inc(),
+                Err(error) if error.is_refusal() => (refused, why) = (refused + 1, Some(error)),
+                Err(error) => {
+                    self.pending.append(row);
+                    rows.for_each(|row| self.pending.append(row));
+                    self.failed(&error);
+                    break;
+                }
+            }
+        }
+        if let Some(why) = why {
+            self.metrics.dropped.inc_by(refused);
+            tracing::error!("{refused} rows of the history are lost: its database refuses them: {why}");
+        }
+        if self.pending.is_empty() {
+            self.works();
+        }
+    }
+
+    fn works(&mut self) {
+        self.metrics.up.set(1);
+        if self.told.take().is_some() {
+            tracing::info!("the history's database is there again");
+        }
     }
 
     /// After the tracks: a picture goes with its track.

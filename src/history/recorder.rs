@@ -70,6 +70,14 @@ impl Batch {
         self.boxes.append(&mut later.boxes);
         self.events.append(&mut later.events);
     }
+
+    /// Each row alone, tracks before what belongs to them.
+    pub(super) fn into_rows(self) -> impl Iterator<Item = Batch> {
+        let tracks = self.tracks.into_iter().map(|row| Batch { tracks: vec![row], ..Batch::default() });
+        let boxes = self.boxes.into_iter().map(|row| Batch { boxes: vec![row], ..Batch::default() });
+        let events = self.events.into_iter().map(|row| Batch { events: vec![row], ..Batch::default() });
+        tracks.chain(boxes).chain(events)
+    }
 }
 
 /// A track that lives. It is recorded from its first confirmed box on.
