@@ -151,7 +151,7 @@ fn crossings_of_a_known_world_are_counted_exactly() {
         let inwards = visitors.iter().filter(passing).filter(|v| v.speed > 0.0).count() as u64;
         let outwards = visitors.iter().filter(passing).filter(|v| v.speed < 0.0).count() as u64;
         let size = (1280, 720);
-        let rules = Rules { lines: vec![upright("door", 0.5)], zones: vec![] };
+        let rules = Rules { lines: vec![upright("door", 0.5)], zones: vec![], ..Rules::default() };
         let mut tracked = Tracked::new(Counter::new(rules, size));
         for frame in 0..25 * 330 {
             let t = f64::from(frame) / 25.0;
@@ -189,6 +189,7 @@ fn crossings_of_crowds_are_counted_nearly() {
             loiter: None,
             capacity: None,
         }],
+        ..Rules::default()
     };
     let (mut known, mut counted, mut wrong) = (0, 0, 0);
     for seed in 0..20 {

@@ -13,6 +13,8 @@ mod ending;
 mod failures;
 #[path = "service/history.rs"]
 mod history;
+#[path = "service/masks.rs"]
+mod masks;
 #[path = "service/page.rs"]
 mod page;
 #[path = "browser/playwright.rs"]

@@ -25,7 +25,7 @@ use std::collections::BTreeMap;
 pub use geometry::Point;
 pub use heat::{HEAT_COLUMNS, HEAT_ROWS, Heat};
 pub use line::{Direction, LineCount};
-pub use rules::{Anchor, Line, MAX_RULES, RuleError, RuleId, Rules, Zone};
+pub use rules::{Anchor, Line, MAX_RULES, Mask, MaskStyle, RuleError, RuleId, Rules, Zone};
 pub use zone::ZoneCount;
 
 use crate::types::{ClassId, FrameTracks, MediaTime, TrackId, TrackState};

@@ -1,4 +1,4 @@
-//! Lines and zones as they are drawn: in fractions of the picture, so that they survive another resolution.
+//! Lines, zones and masks as they are drawn: in fractions of the picture, so that they survive another resolution.
 
 use std::fmt;
 use std::sync::Arc;
@@ -6,16 +6,16 @@ use std::sync::Arc;
 use super::geometry::{Point, area};
 use crate::types::is_name;
 
-/// Lines, and likewise zones, that one camera takes.
+/// Lines, and likewise zones and masks, that one camera takes.
 pub const MAX_RULES: usize = 32;
-/// Points of one line or zone at most.
+/// Points of one line, zone or mask at most.
 const MAX_POINTS: usize = 32;
-/// A zone covers at least this share of the picture.
+/// A zone or mask covers at least this share of the picture.
 const LEAST_AREA: f64 = 1e-4;
 /// A line is at least so long, in fractions of the picture.
 const LEAST_LENGTH: f64 = 0.01;
 
-/// The name of a line or zone: 1 to 64 of `A-Z a-z 0-9 . _ -`, so that it fits a URL and a metric label.
+/// The name of a line, zone or mask: 1 to 64 of `A-Z a-z 0-9 . _ -`, so that it fits a URL and a metric label.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct RuleId(Arc<str>);
 
@@ -80,13 +80,36 @@ pub struct Zone {
     pub capacity: Option<u32>,
 }
 
-/// What is watched on a camera.
+/// How a mask hides what is under it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum MaskStyle {
+    /// Black: nothing of it is left.
+    #[default]
+    Fill,
+    /// Coarse blocks of the mean colour: one sees that something moves, not who.
+    Pixelate,
+}
+
+/// A part of the picture that nobody is to see. Tracks under it are tracked all the same.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mask {
+    /// Its name.
+    pub id: RuleId,
+    /// 3 to 32 corners, in fractions of the picture; the last is joined to the first.
+    pub points: Vec<Point>,
+    /// How it hides.
+    pub style: MaskStyle,
+}
+
+/// What is drawn on a camera.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Rules {
     /// Lines, names differ.
     pub lines: Vec<Line>,
     /// Zones, names differ.
     pub zones: Vec<Zone>,
+    /// Masks, names differ.
+    pub masks: Vec<Mask>,
 }
 
 /// Why a line or a zone cannot be watched.
@@ -98,7 +121,7 @@ pub enum RuleError {
     )]
     Name(String),
     /// Too few points, or too many.
-    #[error("{id} has {got} points: a line has 2 to {MAX_POINTS}, a zone 3 to {MAX_POINTS}")]
+    #[error("{id} has {got} points: a line has 2 to {MAX_POINTS}, a zone or mask 3 to {MAX_POINTS}")]
     PointCount {
         /// Whose.
         id: RuleId,
@@ -119,7 +142,7 @@ pub enum RuleError {
     },
     /// Too small to be crossed or entered.
     #[error(
-        "{id} is too small: a line is at least 0.01 of the picture long, a zone at least 0.0001 of it large"
+        "{id} is too small: a line is at least 0.01 of the picture long, a zone or mask at least 0.0001 of it large"
     )]
     Small {
         /// Which.
@@ -136,7 +159,7 @@ pub enum RuleError {
     /// Two of the same name.
     #[error("two {what}s are named {id}: names must differ")]
     Twice {
-        /// `line` or `zone`.
+        /// `line`, `zone` or `mask`.
         what: &'static str,
         /// The name.
         id: RuleId,
@@ -144,7 +167,7 @@ pub enum RuleError {
     /// Too many.
     #[error("{got} {what}s: a camera takes at most {MAX_RULES}")]
     TooMany {
-        /// `line` or `zone`.
+        /// `line`, `zone` or `mask`.
         what: &'static str,
         /// How many.
         got: usize,
@@ -160,6 +183,7 @@ impl Rules {
         for (what, ids) in [
             ("line", self.lines.iter().map(|l| &l.id).collect::<Vec<_>>()),
             ("zone", self.zones.iter().map(|z| &z.id).collect()),
+            ("mask", self.masks.iter().map(|m| &m.id).collect()),
         ] {
             if ids.len() > MAX_RULES {
                 return Err(RuleError::TooMany { what, got: ids.len() });
@@ -182,6 +206,12 @@ impl Rules {
             }
             if loiter.is_some_and(|s| !(s.is_finite() && s > 0.0)) {
                 return Err(RuleError::Limit { id: id.clone(), what: "loiter_s must be more than 0" });
+            }
+        }
+        for Mask { id, points, .. } in &self.masks {
+            check_points(id, points, 3)?;
+            if area(points) < LEAST_AREA {
+                return Err(RuleError::Small { id: id.clone() });
             }
         }
         Ok(())

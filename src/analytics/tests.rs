@@ -112,7 +112,7 @@ fn a_line_is_crossed_once_by_each_who_crosses_it() {
             vec![crossed(Direction::In)],
         ),
     ] {
-        let mut analyst = Analyst::new(Rules { lines: vec![door()], zones: vec![] });
+        let mut analyst = Analyst::new(Rules { lines: vec![door()], ..Rules::default() });
         assert_eq!(walk(&mut analyst, &path), expected, "{what}");
         let LineCount { inwards, outwards } = analyst.counts().lines[&id("door")];
         let all = expected.len() as u64;
@@ -123,7 +123,7 @@ fn a_line_is_crossed_once_by_each_who_crosses_it() {
 #[test]
 fn a_zone_knows_who_is_in_it_and_for_how_long() {
     let zone = Zone { loiter: Some(2.0), ..right() };
-    let mut analyst = Analyst::new(Rules { lines: vec![], zones: vec![zone] });
+    let mut analyst = Analyst::new(Rules { zones: vec![zone], ..Rules::default() });
     let mut happened = vec![];
     // Comes at 0.5 s, is covered from 2 s to 3 s, goes at 4 s.
     for step in 0..=45 {
@@ -155,7 +155,7 @@ fn a_zone_knows_who_is_in_it_and_for_how_long() {
 
 #[test]
 fn one_who_ends_in_a_zone_leaves_it() {
-    let mut analyst = Analyst::new(Rules { lines: vec![], zones: vec![right()] });
+    let mut analyst = Analyst::new(Rules { zones: vec![right()], ..Rules::default() });
     for step in 0..=12 {
         analyst.update(&report(0.1 * f64::from(step), &[(7, 700.0, 300.0, Confirmed, true)], &[]));
     }
@@ -169,7 +169,7 @@ fn one_who_ends_in_a_zone_leaves_it() {
 
 #[test]
 fn one_match_after_a_gap_is_not_enough() {
-    let mut analyst = Analyst::new(Rules { lines: vec![door()], zones: vec![] });
+    let mut analyst = Analyst::new(Rules { lines: vec![door()], ..Rules::default() });
     // Lost before the line; a false alarm behind it is taken for the track, then nothing.
     let mut path = vec![(400.0, Confirmed, true); 3];
     path.extend([(470.0, Lost, false); 6]);
@@ -177,7 +177,7 @@ fn one_match_after_a_gap_is_not_enough() {
     path.extend([(560.0, Lost, false); 6]);
     assert_eq!(walk(&mut analyst, &path), []);
     // A camera of two frames a second misses nobody for that.
-    let mut slow = Analyst::new(Rules { lines: vec![door()], zones: vec![] });
+    let mut slow = Analyst::new(Rules { lines: vec![door()], ..Rules::default() });
     for (step, x) in [400.0, 430.0, 460.0, 560.0].into_iter().enumerate() {
         slow.update(&report(0.5 * step as f64, &[(1, x, 300.0, Confirmed, true)], &[]));
     }
@@ -187,7 +187,7 @@ fn one_match_after_a_gap_is_not_enough() {
 #[test]
 fn a_crowd_is_one_that_lasts() {
     let zone = Zone { capacity: Some(1), ..right() };
-    let mut analyst = Analyst::new(Rules { lines: vec![], zones: vec![zone] });
+    let mut analyst = Analyst::new(Rules { zones: vec![zone], ..Rules::default() });
     let mut happened = vec![];
     for step in 0..60 {
         // Two for half a second, then one, then two from 2 s to 4 s.
@@ -209,14 +209,14 @@ fn a_crowd_is_one_that_lasts() {
 
 #[test]
 fn rules_change_while_they_are_watched() {
-    let mut analyst = Analyst::new(Rules { lines: vec![door()], zones: vec![right()] });
+    let mut analyst = Analyst::new(Rules { lines: vec![door()], zones: vec![right()], ..Rules::default() });
     walk(&mut analyst, &[(400.0, Confirmed, true), (600.0, Confirmed, true)]);
     let other = Line { id: id("other"), points: points(&[(0.2, 1.0), (0.2, 0.0)]), anchor: Anchor::Centre };
-    analyst.set_rules(Rules { lines: vec![other.clone(), door()], zones: vec![] });
+    analyst.set_rules(Rules { lines: vec![other.clone(), door()], ..Rules::default() });
     assert_eq!(analyst.counts().lines[&id("door")].inwards, 1, "what stays keeps its counts");
     assert!(analyst.counts().zones.is_empty());
     let moved = Line { points: points(&[(0.7, 1.0), (0.7, 0.0)]), ..door() };
-    analyst.set_rules(Rules { lines: vec![other, moved], zones: vec![] });
+    analyst.set_rules(Rules { lines: vec![other, moved], ..Rules::default() });
     assert_eq!(analyst.counts().lines[&id("door")], LineCount::default(), "another line of that name");
     // It was drawn behind a track's back: being on its left is no crossing.
     assert_eq!(walk(&mut analyst, &[(600.0, Confirmed, true), (650.0, Confirmed, true)]), []);
@@ -224,7 +224,7 @@ fn rules_change_while_they_are_watched() {
 
 #[test]
 fn another_epoch_keeps_counts_and_forgets_tracks() {
-    let mut analyst = Analyst::new(Rules { lines: vec![door()], zones: vec![right()] });
+    let mut analyst = Analyst::new(Rules { lines: vec![door()], zones: vec![right()], ..Rules::default() });
     walk(&mut analyst, &[(400.0, Confirmed, true), (600.0, Confirmed, true)]);
     analyst.begin_epoch();
     let counts = analyst.counts();
@@ -251,12 +251,17 @@ fn heat_is_seconds() {
     assert!((cells.iter().sum::<f64>() - 1.9).abs() < 1e-6);
 }
 
+fn window() -> Mask {
+    let points = points(&[(0.0, 0.0), (0.2, 0.0), (0.2, 0.2)]);
+    Mask { id: RuleId::new("window").unwrap(), points, style: MaskStyle::Fill }
+}
+
 #[test]
 fn rules_that_cannot_be_watched_are_refused() {
     let line =
-        |at: &[(f64, f64)]| Rules { lines: vec![Line { points: points(at), ..door() }], zones: vec![] };
+        |at: &[(f64, f64)]| Rules { lines: vec![Line { points: points(at), ..door() }], ..Rules::default() };
     let zone =
-        |at: &[(f64, f64)]| Rules { lines: vec![], zones: vec![Zone { points: points(at), ..right() }] };
+        |at: &[(f64, f64)]| Rules { zones: vec![Zone { points: points(at), ..right() }], ..Rules::default() };
     for (rules, expected) in [
         (line(&[(0.0, 0.0)]), "1 points"),
         (line(&[(0.0, 0.0), (1.1, 0.0)]), "point 1 of door is (1.1, 0)"),
@@ -264,11 +269,16 @@ fn rules_that_cannot_be_watched_are_refused() {
         (line(&[(0.5, 0.5), (0.505, 0.5)]), "too small"),
         (zone(&[(0.0, 0.0), (1.0, 1.0)]), "2 points"),
         (zone(&[(0.0, 0.0), (1.0, 1.0), (0.5, 0.5)]), "too small"),
-        (Rules { lines: vec![door(), door()], zones: vec![] }, "two lines are named door"),
-        (Rules { lines: vec![], zones: vec![Zone { loiter: Some(0.0), ..right() }] }, "loiter_s"),
+        (Rules { lines: vec![door(), door()], ..Rules::default() }, "two lines are named door"),
+        (Rules { masks: vec![window(), window()], ..Rules::default() }, "two masks are named window"),
+        (
+            Rules { masks: vec![Mask { points: points(&[(0.0, 0.0)]), ..window() }], ..Rules::default() },
+            "1 points",
+        ),
+        (Rules { zones: vec![Zone { loiter: Some(0.0), ..right() }], ..Rules::default() }, "loiter_s"),
     ] {
         let error = rules.check().unwrap_err().to_string();
         assert!(error.contains(expected), "{error}");
     }
-    assert!(Rules { lines: vec![door()], zones: vec![right()] }.check().is_ok());
+    assert!(Rules { lines: vec![door()], zones: vec![right()], masks: vec![window()] }.check().is_ok());
 }

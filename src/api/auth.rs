@@ -21,7 +21,7 @@ const CHANGE: Right = Right::Role(Role::Operator);
 const ADMIN: Right = Right::Role(Role::Admin);
 
 /// What each route asks for. One that is not here asks for an admin. `HEAD` asks for what `GET` does.
-pub const RIGHTS: [(&str, &str, Right); 45] = [
+pub const RIGHTS: [(&str, &str, Right); 50] = [
     ("GET", "/v1/cameras", VIEW),
     ("POST", "/v1/cameras", CHANGE),
     ("GET", "/v1/cameras/{id}", VIEW),
@@ -40,6 +40,11 @@ pub const RIGHTS: [(&str, &str, Right); 45] = [
     ("GET", "/v1/cameras/{id}/zones/{zone}", VIEW),
     ("PUT", "/v1/cameras/{id}/zones/{zone}", CHANGE),
     ("DELETE", "/v1/cameras/{id}/zones/{zone}", CHANGE),
+    ("GET", "/v1/cameras/{id}/masks", VIEW),
+    ("POST", "/v1/cameras/{id}/masks", ADMIN),
+    ("GET", "/v1/cameras/{id}/masks/{mask}", VIEW),
+    ("PUT", "/v1/cameras/{id}/masks/{mask}", ADMIN),
+    ("DELETE", "/v1/cameras/{id}/masks/{mask}", ADMIN),
     ("GET", "/v1/cameras/{id}/counts", VIEW),
     ("GET", "/v1/cameras/{id}/heatmap", VIEW),
     ("GET", "/v1/tracks", VIEW),

@@ -9,7 +9,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use tokio::sync::watch;
 
 use super::object::objects;
-use super::rules::{EditError, Findings, LineSpec, RuleEdit, RulesSpec, ZoneSpec};
+use super::rules::{EditError, Findings, LineSpec, MaskSpec, RuleEdit, RulesSpec, ZoneSpec};
 use crate::analytics::{Heat, RuleError, Rules};
 use crate::publish::Picture;
 use crate::types::CameraId;
@@ -37,10 +37,10 @@ pub trait Cameras: Send + Sync + 'static {
     /// when there is no such camera. The sender goes when the camera is removed.
     fn video(&self, id: &CameraId) -> Option<watch::Receiver<Option<Arc<Picture>>>>;
 
-    /// The camera's lines and zones; `None` when there is no such camera.
+    /// The camera's lines, zones and masks; `None` when there is no such camera.
     fn rules(&self, id: &CameraId) -> Option<Rules>;
 
-    /// Changes the camera's lines and zones, and remembers them; gives all of them.
+    /// Changes the camera's lines, zones and masks, and remembers them; gives all of them.
     fn edit_rules(&self, id: &CameraId, edit: RuleEdit) -> BoxFuture<'_, Result<Rules, CameraError>>;
 
     /// What the lines and zones have counted; `None` when there is no such camera.
@@ -75,15 +75,19 @@ pub struct NewCamera {
     /// Zones to begin with, likewise.
     #[serde(default, deserialize_with = "objects", skip_serializing_if = "Vec::is_empty")]
     pub zones: Vec<ZoneSpec>,
+    /// Masks to begin with, likewise.
+    #[serde(default, deserialize_with = "objects", skip_serializing_if = "Vec::is_empty")]
+    pub masks: Vec<MaskSpec>,
 }
 
 impl NewCamera {
-    /// Its lines and zones.
+    /// Its lines, zones and masks.
     ///
     /// # Errors
     /// One of them cannot be watched.
     pub fn rules(&self) -> Result<Rules, RuleError> {
-        RulesSpec { lines: self.lines.clone(), zones: self.zones.clone() }.rules()
+        let (lines, zones, masks) = (self.lines.clone(), self.zones.clone(), self.masks.clone());
+        RulesSpec { lines, zones, masks }.rules()
     }
 }
 
@@ -114,6 +118,7 @@ impl CameraPatch {
             paused: self.paused.unwrap_or(camera.paused),
             lines: camera.lines.clone(),
             zones: camera.zones.clone(),
+            masks: camera.masks.clone(),
         }
     }
 }

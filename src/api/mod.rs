@@ -7,7 +7,7 @@
 //! /v1/cameras/{id}/snapshot.jpg    newest picture, boxes drawn in
 //! /v1/cameras/{id}/stream.mjpeg    live pictures, boxes drawn in
 //! /v1/cameras/{id}/live            WebSocket: pictures as they are, each with its tracks
-//! /v1/cameras/{id}/lines[/{line}]  GET, POST, PUT, DELETE; zones likewise
+//! /v1/cameras/{id}/lines[/{line}]  GET, POST, PUT, DELETE; zones and masks likewise
 //! /v1/cameras/{id}/counts          crossings, occupancies
 //! /v1/cameras/{id}/heatmap         where people were
 //! /v1/session                      who asks; signing in and out
@@ -60,7 +60,9 @@ pub use cameras::{
     CameraError, CameraPatch, CameraState, CameraStatus, Cameras, NewCamera, TrackCounts, Transport,
 };
 pub use operations::{Operations, Reloaded};
-pub use rules::{AnchorSpec, EditError, Findings, LineSpec, Rule, RuleEdit, RulesSpec, ZoneSpec};
+pub use rules::{
+    AnchorSpec, EditError, Findings, LineSpec, MaskSpec, Rule, RuleEdit, RulesSpec, StyleSpec, ZoneSpec,
+};
 pub use server::{serve, serve_with};
 pub use socket::KeepAlive;
 
@@ -152,6 +154,8 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
         .route("/v1/cameras/{id}/lines/{line}", analytics::one_of::<LineSpec>())
         .route("/v1/cameras/{id}/zones", analytics::all_of::<ZoneSpec>())
         .route("/v1/cameras/{id}/zones/{zone}", analytics::one_of::<ZoneSpec>())
+        .route("/v1/cameras/{id}/masks", analytics::all_of::<MaskSpec>())
+        .route("/v1/cameras/{id}/masks/{mask}", analytics::one_of::<MaskSpec>())
         .route("/v1/cameras/{id}/counts", get(analytics::counts))
         .route("/v1/cameras/{id}/heatmap", get(analytics::heat_map))
         .route("/v1/tracks", get(tracks::tracks))

@@ -1,10 +1,10 @@
-//! Lines and zones on the wire, and how they are changed.
+//! Lines, zones and masks on the wire, and how they are changed.
 
 use jiff::Timestamp;
 use serde::de::{DeserializeOwned, Error, Unexpected};
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::analytics::{Anchor, Counts, Line, Point, RuleError, RuleId, Rules, Zone};
+use crate::analytics::{Anchor, Counts, Line, Mask, MaskStyle, Point, RuleError, RuleId, Rules, Zone};
 
 /// A line as it is sent. Unknown fields are refused.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -59,7 +59,31 @@ pub enum AnchorSpec {
     Centre,
 }
 
-/// All lines and zones of a camera.
+/// A mask as it is sent. Unknown fields are refused.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MaskSpec {
+    /// Its name, unique among the camera's masks.
+    pub id: String,
+    /// 3 to 32 corners `[x, y]` in fractions of the picture, from the top left.
+    pub points: Vec<[f64; 2]>,
+    /// How it hides.
+    #[serde(default)]
+    pub style: StyleSpec,
+}
+
+/// How a mask hides what is under it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum StyleSpec {
+    /// Black.
+    #[default]
+    Fill,
+    /// Coarse blocks.
+    Pixelate,
+}
+
+/// All lines, zones and masks of a camera.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RulesSpec {
@@ -69,6 +93,9 @@ pub struct RulesSpec {
     /// Zones.
     #[serde(default)]
     pub zones: Vec<ZoneSpec>,
+    /// Masks.
+    #[serde(default)]
+    pub masks: Vec<MaskSpec>,
 }
 
 /// A change of a camera's rules.
@@ -82,6 +109,8 @@ pub enum RuleEdit {
     RemoveLine(RuleId),
     /// The zone of that name goes.
     RemoveZone(RuleId),
+    /// The mask of that name goes.
+    RemoveMask(RuleId),
 }
 
 /// One of a camera's rules.
@@ -91,6 +120,8 @@ pub enum Rule {
     Line(Line),
     /// A zone.
     Zone(Zone),
+    /// A mask.
+    Mask(Mask),
 }
 
 /// Why a change of the rules is refused.
@@ -105,7 +136,7 @@ pub enum EditError {
     /// There is none of that name.
     #[error("there is no {what} {id:?} on this camera", id = id.as_str())]
     Unknown {
-        /// `line` or `zone`.
+        /// `line`, `zone` or `mask`.
         what: &'static str,
         /// The name.
         id: RuleId,
@@ -122,10 +153,13 @@ impl RuleEdit {
         match self {
             RuleEdit::Add(Rule::Line(line)) => add(&mut rules.lines, line)?,
             RuleEdit::Add(Rule::Zone(zone)) => add(&mut rules.zones, zone)?,
+            RuleEdit::Add(Rule::Mask(mask)) => add(&mut rules.masks, mask)?,
             RuleEdit::Put(Rule::Line(line)) => put(&mut rules.lines, line),
             RuleEdit::Put(Rule::Zone(zone)) => put(&mut rules.zones, zone),
+            RuleEdit::Put(Rule::Mask(mask)) => put(&mut rules.masks, mask),
             RuleEdit::RemoveLine(id) => remove(&mut rules.lines, id)?,
             RuleEdit::RemoveZone(id) => remove(&mut rules.zones, id)?,
+            RuleEdit::RemoveMask(id) => remove(&mut rules.masks, id)?,
         }
         rules.check()?;
         Ok(rules)
@@ -146,6 +180,13 @@ impl Named for Line {
 
 impl Named for Zone {
     const WHAT: &'static str = "zone";
+    fn id(&self) -> &RuleId {
+        &self.id
+    }
+}
+
+impl Named for Mask {
+    const WHAT: &'static str = "mask";
     fn id(&self) -> &RuleId {
         &self.id
     }
@@ -172,7 +213,7 @@ fn remove<T: Named>(all: &mut Vec<T>, id: RuleId) -> Result<(), EditError> {
     if all.len() < before { Ok(()) } else { Err(EditError::Unknown { what: T::WHAT, id }) }
 }
 
-/// What lines and zones have in common on the wire.
+/// What lines, zones and masks have in common on the wire.
 pub(super) trait Drawn: Clone + Serialize + DeserializeOwned + Send + Sync + 'static {
     const WHAT: &'static str;
     /// As the paths have it.
@@ -226,6 +267,45 @@ impl Drawn for ZoneSpec {
     }
 }
 
+impl Drawn for MaskSpec {
+    const WHAT: &'static str = Mask::WHAT;
+    const PLURAL: &'static str = "masks";
+
+    fn of(rules: RulesSpec) -> Vec<Self> {
+        rules.masks
+    }
+
+    fn name(&self) -> &str {
+        &self.id
+    }
+
+    fn rule(self) -> Result<Rule, RuleError> {
+        self.try_into().map(Rule::Mask)
+    }
+
+    fn removal(id: RuleId) -> RuleEdit {
+        RuleEdit::RemoveMask(id)
+    }
+}
+
+impl From<StyleSpec> for MaskStyle {
+    fn from(style: StyleSpec) -> Self {
+        match style {
+            StyleSpec::Fill => MaskStyle::Fill,
+            StyleSpec::Pixelate => MaskStyle::Pixelate,
+        }
+    }
+}
+
+impl From<MaskStyle> for StyleSpec {
+    fn from(style: MaskStyle) -> Self {
+        match style {
+            MaskStyle::Fill => StyleSpec::Fill,
+            MaskStyle::Pixelate => StyleSpec::Pixelate,
+        }
+    }
+}
+
 impl From<AnchorSpec> for Anchor {
     fn from(anchor: AnchorSpec) -> Self {
         match anchor {
@@ -270,6 +350,20 @@ impl TryFrom<ZoneSpec> for Zone {
     }
 }
 
+impl TryFrom<MaskSpec> for Mask {
+    type Error = RuleError;
+
+    fn try_from(spec: MaskSpec) -> Result<Self, RuleError> {
+        Ok(Self { id: RuleId::new(&spec.id)?, points: points(spec.points), style: spec.style.into() })
+    }
+}
+
+impl From<&Mask> for MaskSpec {
+    fn from(mask: &Mask) -> Self {
+        Self { id: mask.id.to_string(), points: pairs(&mask.points), style: mask.style.into() }
+    }
+}
+
 impl From<&Line> for LineSpec {
     fn from(line: &Line) -> Self {
         Self { id: line.id.to_string(), points: pairs(&line.points), anchor: line.anchor.into() }
@@ -289,7 +383,7 @@ impl From<&Zone> for ZoneSpec {
 }
 
 impl RulesSpec {
-    /// What is to be watched.
+    /// What is drawn.
     ///
     /// # Errors
     /// [`RuleError`], of the first that cannot be.
@@ -297,6 +391,7 @@ impl RulesSpec {
         let rules = Rules {
             lines: self.lines.into_iter().map(Line::try_from).collect::<Result<_, _>>()?,
             zones: self.zones.into_iter().map(Zone::try_from).collect::<Result<_, _>>()?,
+            masks: self.masks.into_iter().map(Mask::try_from).collect::<Result<_, _>>()?,
         };
         rules.check()?;
         Ok(rules)
@@ -308,6 +403,7 @@ impl From<&Rules> for RulesSpec {
         Self {
             lines: rules.lines.iter().map(LineSpec::from).collect(),
             zones: rules.zones.iter().map(ZoneSpec::from).collect(),
+            masks: rules.masks.iter().map(MaskSpec::from).collect(),
         }
     }
 }

@@ -15,7 +15,7 @@ use tokio::sync::{Semaphore, watch};
 use tokio::task::spawn_blocking;
 
 use super::Cameras;
-use crate::publish::{Picture, PictureError, Rgb, RgbConverter, Trails, annotate};
+use crate::publish::{Masks, Picture, PictureError, Rgb, RgbConverter, Trails, annotate};
 use crate::types::{CameraId, FrameTracks};
 
 /// Pictures encoded at a time, over all cameras.
@@ -98,11 +98,14 @@ async fn film(
 ) {
     let lens = Lens { view: key.1, max_width: LIVE_WIDTH, quality: LIVE_QUALITY };
     let mut room = Darkroom::default();
+    let mut masks = Masks::none();
     // The picture that is already there is wanted as well.
     source.mark_changed();
     loop {
         let here = tokio::select! {
             changed = source.changed() => changed.is_ok(),
+            // A camera may stand still: its last picture is made again.
+            () = masks.changed() => true,
             () = shots.closed() => true,
         };
         {
@@ -118,6 +121,8 @@ async fn film(
         let _turn = gate.acquire().await;
         // Whatever came while waiting for the turn: the newest.
         let Some(picture) = source.borrow_and_update().clone() else { continue };
+        masks = picture.masks().clone();
+        masks.mark_seen();
         let (back, shot) = expose(room, lens, picture).await;
         room = back;
         match shot {
@@ -148,7 +153,7 @@ async fn expose(
     lens: Lens,
     picture: Arc<Picture>,
 ) -> (Darkroom, Result<Shot, PictureError>) {
-    let size = (picture.frame.image.width as usize, picture.frame.image.height as usize);
+    let size = (picture.size().0 as usize, picture.size().1 as usize);
     let made = spawn_blocking(move || {
         let shot = room.expose(lens, &picture);
         (room, shot)
@@ -160,7 +165,7 @@ async fn expose(
 
 impl Darkroom {
     fn expose(&mut self, lens: Lens, picture: &Picture) -> Result<Shot, PictureError> {
-        self.converter.convert(&picture.frame.image, lens.max_width, &mut self.canvas)?;
+        self.converter.convert(picture, lens.max_width, &mut self.canvas)?;
         if lens.view == View::Annotated {
             self.trails.push(&picture.tracks);
             annotate(&mut self.canvas, &picture.tracks, &self.trails);

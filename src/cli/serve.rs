@@ -328,6 +328,7 @@ fn camera(text: &str, looped: bool) -> Result<NewCamera> {
         paused: false,
         lines: vec![],
         zones: vec![],
+        masks: vec![],
     })
 }
 

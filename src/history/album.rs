@@ -91,7 +91,7 @@ fn cut_out(
     wanted: Vec<(TrackKey, TrackReport, f64)>,
 ) -> Result<Vec<Snapshot>, PictureError> {
     let mut canvas = Rgb::default();
-    RgbConverter::default().convert(&picture.frame.image, usize::MAX, &mut canvas)?;
+    RgbConverter::default().convert(picture, usize::MAX, &mut canvas)?;
     let mut snapshots = vec![];
     for (key, track, score) in wanted {
         let (b, around) = (track.bbox, AROUND * track.bbox.h);

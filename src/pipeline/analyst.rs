@@ -1,12 +1,13 @@
-//! One camera's lines and zones in the service: fed by the tracker's thread, changed and read by the API.
+//! One camera's lines, zones and masks in the service: fed by the tracker's thread, changed and read by the API.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use jiff::Timestamp;
+use tokio::sync::watch;
 
-use crate::analytics::{Analyst, Counts, Happening, Heat, Rules, What};
-use crate::publish::{EventHub, event_kind};
+use crate::analytics::{Analyst, Counts, Happening, Heat, Mask, Rules, What};
+use crate::publish::{EventHub, Masks, event_kind};
 use crate::telemetry::Metrics;
 use crate::types::{CameraId, FrameTracks};
 
@@ -16,6 +17,7 @@ pub struct CameraAnalyst {
     camera: CameraId,
     since: Timestamp,
     analyst: Mutex<Analyst>,
+    masks: watch::Sender<Arc<[Mask]>>,
     metrics: Arc<Metrics>,
     events: EventHub,
 }
@@ -23,7 +25,9 @@ pub struct CameraAnalyst {
 impl CameraAnalyst {
     /// Watches `rules` on `camera`.
     pub fn new(camera: CameraId, rules: Rules, metrics: Arc<Metrics>, events: EventHub) -> Self {
-        let this = Self { camera, since: Timestamp::now(), analyst: Mutex::default(), metrics, events };
+        let since = Timestamp::now();
+        let masks = watch::Sender::default();
+        let this = Self { camera, since, analyst: Mutex::default(), masks, metrics, events };
         this.set_rules(rules);
         this
     }
@@ -73,8 +77,23 @@ impl CameraAnalyst {
         self.show_occupancy(&analyst);
     }
 
-    /// Watches other rules from now on; they have been checked.
+    /// What is hidden of the camera's pictures, now and whenever that changes.
+    pub fn masks(&self) -> Masks {
+        Masks::follow(&self.masks)
+    }
+
+    /// Watches and hides by other rules from now on; they have been checked.
     pub fn set_rules(&self, rules: Rules) {
+        self.masks.send_replace(rules.masks.as_slice().into());
+        self.watch(rules);
+    }
+
+    /// The camera goes. What was hidden of its last picture stays hidden.
+    pub fn end(&self) {
+        self.watch(Rules::default());
+    }
+
+    fn watch(&self, rules: Rules) {
         let mut analyst = self.analyst();
         let before = analyst.rules();
         let lines: BTreeSet<_> = rules.lines.iter().map(|l| &l.id).collect();
@@ -95,7 +114,7 @@ impl CameraAnalyst {
         self.show_occupancy(&analyst);
     }
 
-    /// What is watched.
+    /// What is watched and hidden.
     pub fn rules(&self) -> Rules {
         self.analyst().rules().clone()
     }

@@ -5,12 +5,13 @@ use std::sync::Arc;
 use tokio::sync::{mpsc, watch};
 
 use super::analyst::CameraAnalyst;
-use crate::publish::{Hub, Picture};
+use crate::publish::{Hub, Masks, Picture};
+use crate::types::{Frame, FrameTracks};
 
 /// Takes tracked frames, on the tracker's thread.
 pub trait Outlet: Send {
     /// Takes one frame with its tracks.
-    fn emit(&mut self, picture: Picture);
+    fn emit(&mut self, frame: Arc<Frame>, tracks: Arc<FrameTracks>);
 }
 
 /// The service's outlet: never waits.
@@ -24,9 +25,9 @@ pub struct LiveOutlet {
 }
 
 impl Outlet for LiveOutlet {
-    fn emit(&mut self, picture: Picture) {
-        let tracks = picture.tracks.clone();
+    fn emit(&mut self, frame: Arc<Frame>, tracks: Arc<FrameTracks>) {
         self.hub.publish(tracks.clone());
+        let picture = Picture::new(frame, tracks.clone(), self.analyst.masks());
         self.video.send_replace(Some(Arc::new(picture)));
         self.analyst.take(&tracks);
     }
@@ -36,8 +37,8 @@ impl Outlet for LiveOutlet {
 pub struct Collector(pub mpsc::Sender<Picture>);
 
 impl Outlet for Collector {
-    fn emit(&mut self, picture: Picture) {
+    fn emit(&mut self, frame: Arc<Frame>, tracks: Arc<FrameTracks>) {
         // A reader that went away wants no more; the source is being stopped.
-        let _ = self.0.blocking_send(picture);
+        let _ = self.0.blocking_send(Picture::new(frame, tracks, Masks::none()));
     }
 }

@@ -14,7 +14,7 @@ use super::camera::{Camera, CameraPlan, CameraState, CameraView, Lanes, MAX_CAME
 use super::mailbox::Policy;
 use super::outlet::LiveOutlet;
 use super::store::{Remembered, Store};
-use crate::analytics::{Heat, Rules};
+use crate::analytics::{Heat, Mask, MaskStyle, Point, RuleId, Rules};
 use crate::api::{
     self, CameraError, CameraPatch, CameraStatus, Cameras, EditError, Findings, NewCamera, RuleEdit,
     RulesSpec, TrackCounts,
@@ -136,7 +136,7 @@ impl CameraSet {
             running.stop().await;
         }
         if let Some(shown) = shown {
-            shown.analyst.set_rules(Rules::default());
+            shown.analyst.end();
         }
         self.metrics.forget_camera(id);
         Ok(())
@@ -200,15 +200,18 @@ impl CameraSet {
         // What was changed at run time wins; it was checked when it was remembered, but by an older program perhaps.
         let changed = changes.remembered.rules.get(camera.id.as_str()).cloned();
         let rules = changed.map_or(Ok(first_rules), RulesSpec::rules).unwrap_or_else(|error| {
-            tracing::error!(camera = %camera.id, %error, "its remembered lines and zones cannot be watched");
-            Rules::default()
+            tracing::error!(
+                camera = %camera.id, %error,
+                "its remembered lines, zones and masks cannot be used: its whole picture is hidden until its mask is removed"
+            );
+            hide_everything()
         });
         let analyst = CameraAnalyst::new(camera.id.clone(), rules, self.metrics.clone(), self.events.clone());
         match self.launch(&mut changes, camera.clone(), spec, epoch, Arc::new(analyst)).await {
             Ok(status) => Ok(status),
             Err(error) => {
                 if let Some(shown) = self.shown().remove(&camera.id) {
-                    shown.analyst.set_rules(Rules::default());
+                    shown.analyst.end();
                 }
                 changes.cameras.remove(&camera.id);
                 self.metrics.forget_camera(&camera.id);
@@ -394,6 +397,15 @@ impl Cameras for CameraSet {
     fn heat(&self, id: &CameraId) -> Option<(Timestamp, Heat)> {
         self.analyst(id).map(|analyst| (analyst.since(), analyst.heat()))
     }
+}
+
+/// What was to be hidden is not known.
+fn hide_everything() -> Rules {
+    let corners = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)];
+    let points = corners.map(|(x, y)| Point { x, y }).to_vec();
+    let id = RuleId::new("unknown").into_iter();
+    let masks = id.map(|id| Mask { id, points: points.clone(), style: MaskStyle::Fill }).collect();
+    Rules { masks, ..Rules::default() }
 }
 
 /// A camera's source as the service plays it: files in real time.

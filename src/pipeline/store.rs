@@ -114,6 +114,7 @@ mod tests {
             paused: false,
             lines: vec![],
             zones: vec![],
+            masks: vec![],
         };
         let rules = BTreeMap::from([("gate".into(), RulesSpec::default())]);
         let saved = Remembered { epoch: 7, cameras: vec![camera], rules };

@@ -15,7 +15,6 @@ use super::link::LinkJob;
 use super::outlet::Outlet;
 use crate::egomotion::Egomotion;
 use crate::infer::InferError;
-use crate::publish::Picture;
 use crate::telemetry::{CameraMetrics, DropReason, Metrics, Stage};
 use crate::track::shift::Shift;
 use crate::track::{FrameInput, LinkRequest, Tracker, TrackerConfig, Update};
@@ -289,15 +288,14 @@ impl Desk {
             ended,
         };
         self.seq += 1;
-        let picture = Picture { frame, tracks: Arc::new(report) };
-        self.metrics.latency.observe(picture.frame.decoded.elapsed().as_secs_f64());
-        if picture.frame.capture.clock != Clock::Media
+        self.metrics.latency.observe(frame.decoded.elapsed().as_secs_f64());
+        if frame.capture.clock != Clock::Media
             && let Ok(now) = SystemTime::now().duration_since(UNIX_EPOCH)
         {
-            let age = now.as_nanos() as i64 - picture.frame.capture.unix_ns;
+            let age = now.as_nanos() as i64 - frame.capture.unix_ns;
             self.metrics.capture_latency.observe(age as f64 * 1e-9);
         }
-        self.outlet.emit(picture);
+        self.outlet.emit(frame, Arc::new(report));
         ticket.tracked();
         drop(permit);
     }

@@ -10,6 +10,7 @@ mod event;
 mod filter;
 mod hub;
 mod json;
+mod mask;
 mod picture;
 mod protobuf;
 mod report;
@@ -19,6 +20,7 @@ pub use event::{EVENT_KINDS, EventFilter, EventHub, EventListener, Heard, Number
 pub use filter::{Sieve, Sifted, TrackFilter};
 pub use hub::{Event, Gap, Hub, HubConfig, HubMetrics, Only, Subscription};
 pub(crate) use json::CaptureTs;
+pub use mask::Masks;
 pub use picture::{Picture, PictureError, Rgb, RgbConverter};
 pub use protobuf::wire;
 pub(crate) use report::class_name;

@@ -8,15 +8,34 @@ use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer
 use jpeg_encoder::{ColorType, Encoder};
 use yuv::{YuvPlanarImage, YuvStandardMatrix};
 
+use super::mask::{Masks, hide};
+use crate::analytics::Mask;
 use crate::types::{Frame, FrameTracks, Image, YuvMatrix, YuvRange};
 
-/// A frame together with what the tracker said about it.
+/// A frame together with what the tracker said about it. Its pixels are seen through its camera's masks alone.
 #[derive(Clone, Debug)]
 pub struct Picture {
-    /// The frame.
-    pub frame: Arc<Frame>,
+    frame: Arc<Frame>,
+    masks: Masks,
     /// Its tracks.
     pub tracks: Arc<FrameTracks>,
+}
+
+impl Picture {
+    /// Of a camera with `masks`.
+    pub fn new(frame: Arc<Frame>, tracks: Arc<FrameTracks>, masks: Masks) -> Self {
+        Self { frame, masks, tracks }
+    }
+
+    /// Width and height of the frame.
+    pub fn size(&self) -> (u32, u32) {
+        (self.frame.image.width, self.frame.image.height)
+    }
+
+    /// The masks of its camera.
+    pub fn masks(&self) -> &Masks {
+        &self.masks
+    }
 }
 
 /// A picture in packed RGB: 3 bytes a pixel, rows without padding.
@@ -96,16 +115,36 @@ pub struct RgbConverter {
 }
 
 impl RgbConverter {
-    /// `image` in full-range RGB at most `max_width` wide (its shape kept), into `out`.
+    /// `picture` in full-range RGB at most `max_width` wide (its shape kept), into `out`. What its camera's masks
+    /// hide now is hidden.
     ///
     /// # Errors
     /// [`PictureError::Convert`] or [`PictureError::Scale`]: the library refused the sizes.
-    pub fn convert(&mut self, image: &Image, max_width: usize, out: &mut Rgb) -> Result<(), PictureError> {
+    pub fn convert(
+        &mut self,
+        picture: &Picture,
+        max_width: usize,
+        out: &mut Rgb,
+    ) -> Result<(), PictureError> {
+        self.masked(&picture.frame.image, &picture.masks.now(), max_width, out)
+    }
+
+    fn masked(
+        &mut self,
+        image: &Image,
+        masks: &[Mask],
+        max_width: usize,
+        out: &mut Rgb,
+    ) -> Result<(), PictureError> {
         let (width, height) = (image.width as usize, image.height as usize);
         if width <= max_width {
-            return to_rgb(image, out);
+            to_rgb(image, out)?;
+            hide(out, masks);
+            return Ok(());
         }
         to_rgb(image, &mut self.full)?;
+        // Before it is scaled: scaling takes neighbours in.
+        hide(&mut self.full, masks);
         let scaled = (height * max_width + width / 2) / width;
         out.resize(max_width, scaled.max(1));
         self.scale(out).map_err(|error| PictureError::Scale(out.width, out.height, error.to_string()))
@@ -188,7 +227,7 @@ mod tests {
         ] {
             let mut out = Rgb::default();
             let image = plain((7, 5), yuv, range, matrix);
-            RgbConverter::default().convert(&image, 100, &mut out).unwrap();
+            RgbConverter::default().masked(&image, &[], 100, &mut out).unwrap();
             for (x, y) in [(0, 0), (6, 4), (6, 0)] {
                 let near = out.pixel(x, y).iter().zip(expected).all(|(a, b)| a.abs_diff(b) <= 3);
                 assert!(near, "{yuv:?} {range:?} {matrix:?}: {:?}, not {expected:?}", out.pixel(x, y));
@@ -207,7 +246,7 @@ mod tests {
         ] {
             let mut out = Rgb::default();
             let image = plain(size, [235, 128, 128], YuvRange::Limited, YuvMatrix::Bt601);
-            RgbConverter::default().convert(&image, max_width, &mut out).unwrap();
+            RgbConverter::default().masked(&image, &[], max_width, &mut out).unwrap();
             assert_eq!((out.width, out.height), expected);
             assert_eq!(out.data.len(), out.width * out.height * 3);
             assert!(out.data.iter().all(|v| *v >= 254), "{size:?} is white");

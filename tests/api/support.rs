@@ -15,7 +15,7 @@ use gakp::api::{
     RuleEdit, TrackCounts,
 };
 use gakp::auth::Gate;
-use gakp::publish::{EventHub, Hub, HubConfig, Picture};
+use gakp::publish::{EventHub, Hub, HubConfig, Masks, Picture};
 use gakp::types::{
     BBox, CameraId, CaptureTime, ClassId, Clock, Epoch, Frame, FrameTracks, Image, MediaTime, Plane, TrackId,
     TrackReport, TrackState, YuvMatrix, YuvRange,
@@ -449,5 +449,5 @@ pub fn picture(tracks: FrameTracks) -> Picture {
         decoded: Instant::now(),
         image,
     };
-    Picture { frame: Arc::new(frame), tracks: Arc::new(tracks) }
+    Picture::new(Arc::new(frame), Arc::new(tracks), Masks::none())
 }

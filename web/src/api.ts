@@ -41,6 +41,12 @@ export interface Zone extends Line {
   capacity?: number;
 }
 
+export interface Mask {
+  id: string;
+  points: Point[];
+  style?: "fill" | "pixelate";
+}
+
 export interface LineCount {
   in: number;
   out: number;

@@ -17,6 +17,8 @@ export const awake = signal(!document.hidden);
 export const mustSignIn = computed(() => session.value?.auth === "required" && session.value.role === null);
 /** Whether cameras, lines and zones may be changed. */
 export const mayEdit = computed(() => session.value?.role === "operator" || session.value?.role === "admin");
+/** Whether what is hidden of pictures may be changed. */
+export const mayHide = computed(() => session.value?.role === "admin");
 /** Whether pictures may be seen. */
 export const maySee = computed(() => session.value?.video === true);
 

@@ -117,6 +117,38 @@ test("a camera is added, seen, counted and searched", async ({ page, request }) 
     await expect(page.getByRole("heading", { name: "Counts" })).toBeVisible();
   });
 
+  await test.step("a part of the picture is hidden, and shown again", async () => {
+    /** The brightest of nine points in the middle of the picture. */
+    const brightest = () =>
+      page.locator("canvas.picture").evaluate((element) => {
+        const canvas = element as HTMLCanvasElement;
+        const values = [-6, 0, 6].flatMap((dx) =>
+          [-6, 0, 6].flatMap((dy) => [
+            ...canvas.getContext("2d")!.getImageData(canvas.width * 0.5 + dx, canvas.height * 0.5 + dy, 1, 1).data.slice(0, 3),
+          ]),
+        );
+        return Math.max(...values);
+      });
+    await expect.poll(brightest).toBeGreaterThan(40);
+    await page.getByRole("button", { name: "Hide a part" }).click();
+    for (const corner of [[0.3, 0.3], [0.7, 0.3], [0.7, 0.7], [0.3, 0.7]] as const) await clickAt(page, [...corner]);
+    await page.getByRole("button", { name: "Finish" }).click();
+    await expect(page.getByRole("form", { name: "New mask" })).toBeVisible();
+    await page.getByRole("button", { name: "Save" }).click();
+    await expect.poll(brightest).toBeLessThan(12);
+    await picture(page, "hidden");
+    await accessible(page);
+    await page.getByRole("button", { name: "Change mask mask-1" }).press("Enter");
+    await page.getByLabel("How it hides").selectOption("pixelate");
+    await page.getByRole("button", { name: "Save" }).click();
+    await expect.poll(brightest).toBeGreaterThan(40);
+    const { masks } = await (await request.get("/v1/cameras/gate/masks")).json();
+    expect(masks).toMatchObject([{ id: "mask-1", style: "pixelate" }]);
+    await page.getByRole("button", { name: "Change mask mask-1" }).click();
+    await page.getByRole("button", { name: "Delete", exact: true }).last().click();
+    await expect(page.getByRole("button", { name: "Change mask mask-1" })).toBeHidden();
+  });
+
   await test.step("the heat map lies over the picture", async () => {
     await page.getByRole("button", { name: "Heat map" }).click();
     const heat = page.getByRole("img", { name: /^Heat map/ });

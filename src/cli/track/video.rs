@@ -145,18 +145,14 @@ impl<'a> Film<'a> {
     }
 
     fn add(&mut self, picture: &Picture, fps: Option<f64>) -> Result<()> {
-        let image = &picture.frame.image;
-        self.converter.convert(image, usize::MAX, &mut self.canvas)?;
+        self.converter.convert(picture, usize::MAX, &mut self.canvas)?;
         self.trails.push(&picture.tracks);
         annotate(&mut self.canvas, &picture.tracks, &self.trails);
         let writer = match &mut self.writer {
             Some(writer) => writer,
-            none => none.insert(VideoWriter::create(
-                self.path,
-                (image.width, image.height),
-                fps.unwrap_or(25.0),
-                Pixels::Rgb,
-            )?),
+            none => {
+                none.insert(VideoWriter::create(self.path, picture.size(), fps.unwrap_or(25.0), Pixels::Rgb)?)
+            }
         };
         writer.write_rgb(&self.canvas.data, picture.tracks.time).context("writing the annotated video")
     }

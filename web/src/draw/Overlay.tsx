@@ -1,8 +1,8 @@
-// Lines and zones over the live picture, and drawing them: with the mouse, a finger, or the arrow keys.
+// Lines, zones and masks over the live picture, and drawing them: with the mouse, a finger, or the arrow keys.
 
 import { useSignal } from "@preact/signals";
 import { useEffect, useLayoutEffect, useRef } from "preact/hooks";
-import type { Line, Point, Zone } from "../api";
+import type { Line, Mask, Point, Zone } from "../api";
 import { clamp, middle, sides } from "./geometry";
 import { leastPoints, MOST_POINTS, type Draft, type Kind, type Rules } from "./rules";
 
@@ -15,6 +15,8 @@ interface Props {
   finish: () => void;
   cancel: () => void;
   pick?: (kind: Kind, name: string) => void;
+  /** Likewise for masks. Without it they are not outlined: the picture shows them. */
+  pickMask?: (kind: Kind, name: string) => void;
 }
 
 function arrow(key: string, far: boolean): Point | null {
@@ -33,7 +35,7 @@ function arrow(key: string, far: boolean): Point | null {
   }
 }
 
-export function Overlay({ rules, draft, change, finish, cancel, pick }: Props) {
+export function Overlay({ rules, draft, change, finish, cancel, pick, pickMask }: Props) {
   const svg = useRef<SVGSVGElement>(null);
   const size = useSignal<Point>([960, 540]);
   /** Where the next point would be put, while drawing. */
@@ -73,11 +75,11 @@ export function Overlay({ rules, draft, change, finish, cancel, pick }: Props) {
   const move = (index: number, to: Point) =>
     draft && change({ ...draft, points: draft.points.map((p, i) => (i === index ? to : p)) });
 
-  /** Puts the next point. Two make a line; a zone closes at its first corner. */
+  /** Puts the next point. Two make a line; a zone or mask closes at its first corner. */
   const put = (point: Point) => {
     if (!draft) return;
     const { points, kind } = draft;
-    if (kind === "zone" && points.length >= 3 && near(point, points[0]!)) return finish();
+    if (kind !== "line" && points.length >= 3 && near(point, points[0]!)) return finish();
     if (points.length > 0 && near(point, points[points.length - 1]!)) return;
     const next = [...points, point];
     const done = (kind === "line" && next.length === 2) || next.length === MOST_POINTS;
@@ -152,7 +154,7 @@ export function Overlay({ rules, draft, change, finish, cancel, pick }: Props) {
   const path = (points: Point[]) => points.map((p) => pixel(p).map((v) => v.toFixed(1)).join(",")).join(" ");
   const quiet = draft !== null;
   const label = !draft
-    ? "Lines and zones"
+    ? "Lines, zones and masks"
     : draft.open
       ? `Drawing a ${draft.kind}. Arrow keys move the cross, space puts a point, Enter finishes, Escape stops.`
       : `Changing ${draft.name}. Tab goes from point to point, arrow keys move it, Delete removes it.`;
@@ -171,10 +173,15 @@ export function Overlay({ rules, draft, change, finish, cancel, pick }: Props) {
       onPointerLeave={() => (hover.value = false)}
       onKeyDown={key}
     >
+      {(pickMask ? rules.masks : [])
+        .filter((mask) => draft?.kind !== "mask" || draft.was !== mask.id)
+        .map((mask) => (
+          <AreaShape key={mask.id} kind="mask" area={mask} path={path} pixel={pixel} quiet={quiet} pick={quiet ? undefined : pickMask} />
+        ))}
       {rules.zones
         .filter((zone) => draft?.kind !== "zone" || draft.was !== zone.id)
         .map((zone) => (
-          <ZoneShape key={zone.id} zone={zone} path={path} pixel={pixel} quiet={quiet} pick={quiet ? undefined : pick} />
+          <AreaShape key={zone.id} kind="zone" area={zone} path={path} pixel={pixel} quiet={quiet} pick={quiet ? undefined : pick} />
         ))}
       {rules.lines
         .filter((line) => draft?.kind !== "line" || draft.was !== line.id)
@@ -183,7 +190,7 @@ export function Overlay({ rules, draft, change, finish, cancel, pick }: Props) {
         ))}
       {draft && (
         <g class="draft">
-          {draft.kind === "zone" && draft.points.length > 2 && !draft.open ? (
+          {draft.kind !== "line" && draft.points.length > 2 && !draft.open ? (
             <polygon points={path(draft.points)} class="shape" />
           ) : (
             <polyline
@@ -219,7 +226,7 @@ export function Overlay({ rules, draft, change, finish, cancel, pick }: Props) {
 /** A grip in the middle of each stretch, from which a new point is pulled. */
 function Between({ draft, pixel }: { draft: Draft; pixel: (p: Point) => Point }) {
   const { points } = draft;
-  const stretches = draft.kind === "zone" ? points.length : points.length - 1;
+  const stretches = draft.kind !== "line" ? points.length : points.length - 1;
   return (
     <>
       {Array.from({ length: stretches }, (_, i) => {
@@ -282,20 +289,22 @@ function LineShape(props: {
   );
 }
 
-function ZoneShape(props: {
-  zone: Zone;
+function AreaShape(props: {
+  kind: "zone" | "mask";
+  area: Zone | Mask;
   path: (points: Point[]) => string;
   pixel: (p: Point) => Point;
   quiet: boolean;
   pick?: (kind: Kind, name: string) => void;
 }) {
-  const { zone, path, pixel, quiet, pick } = props;
-  const [x, y] = pixel(middle(zone.points));
+  const { kind, area, path, pixel, quiet, pick } = props;
+  const [x, y] = pixel(middle(area.points));
+  const name = { [`data-${kind}`]: area.id };
   return (
-    <g class={`rule zone${quiet ? " quiet" : ""}${pick ? " pick" : ""}`} data-zone={zone.id} onClick={() => pick?.("zone", zone.id)}>
-      <polygon points={path(zone.points)} class="shape" />
+    <g class={`rule ${kind}${quiet ? " quiet" : ""}${pick ? " pick" : ""}`} {...name} onClick={() => pick?.(kind, area.id)}>
+      <polygon points={path(area.points)} class="shape" />
       <text class="name" x={x} y={y} text-anchor="middle" dominant-baseline="central">
-        {zone.id}
+        {area.id}
       </text>
     </g>
   );

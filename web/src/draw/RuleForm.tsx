@@ -35,7 +35,7 @@ export function RuleForm(props: {
           ? "Click where the line begins on the picture."
           : "Now click where it ends."
         : left > 0
-          ? `Click the corners of the zone on the picture. ${left} more at least.`
+          ? `Click the corners of the ${what} on the picture. ${left} more at least.`
           : "Click more corners, or the first one again to finish.";
     return (
       <section class="panel rule-form" aria-label={`Draw a ${what}`}>
@@ -43,7 +43,7 @@ export function RuleForm(props: {
         <p role="status">{hint}</p>
         <p class="quiet">By keyboard: arrow keys move the cross, space puts a point, Enter finishes.</p>
         <div class="row">
-          {what === "zone" && (
+          {what !== "line" && (
             <button type="button" class="main" disabled={left > 0} onClick={() => change({ ...draft, open: false })}>
               Finish
             </button>
@@ -82,6 +82,18 @@ export function RuleForm(props: {
         <button type="button" onClick={() => change({ ...draft, points: draft.points.toReversed() })}>
           Swap in and out
         </button>
+      ) : what === "mask" ? (
+        <label>
+          How it hides
+          <select
+            name="style"
+            value={draft.style}
+            onChange={(event) => change({ ...draft, style: event.currentTarget.value as Draft["style"] })}
+          >
+            <option value="fill">black</option>
+            <option value="pixelate">coarse blocks</option>
+          </select>
+        </label>
       ) : (
         <div class="pair">
           <label>
@@ -110,18 +122,22 @@ export function RuleForm(props: {
           </label>
         </div>
       )}
-      <label>
-        What has to be {what === "line" ? "across" : "inside"}
-        <select
-          name="anchor"
-          value={draft.anchor}
-          onChange={(event) => change({ ...draft, anchor: event.currentTarget.value as Draft["anchor"] })}
-        >
-          <option value="foot">the feet</option>
-          <option value="centre">the middle of the body</option>
-        </select>
-      </label>
-      {draft.was && <p class="quiet">What is changed counts from zero again.</p>}
+      {what === "mask" ? (
+        <p class="quiet">Nobody sees what is under it, in no picture. People there are tracked and counted all the same.</p>
+      ) : (
+        <label>
+          What has to be {what === "line" ? "across" : "inside"}
+          <select
+            name="anchor"
+            value={draft.anchor}
+            onChange={(event) => change({ ...draft, anchor: event.currentTarget.value as Draft["anchor"] })}
+          >
+            <option value="foot">the feet</option>
+            <option value="centre">the middle of the body</option>
+          </select>
+        </label>
+      )}
+      {draft.was && what !== "mask" && <p class="quiet">What is changed counts from zero again.</p>}
       <p role="alert" class="bad">
         {error}
       </p>

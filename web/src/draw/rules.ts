@@ -1,10 +1,10 @@
-// A camera's lines and zones: what there is, and what is being drawn.
+// A camera's lines, zones and masks: what there is, and what is being drawn.
 
-import { ask, cameraPath, type Line, type Point, type Zone } from "../api";
+import { ask, cameraPath, type Line, type Mask, type Point, type Zone } from "../api";
 
-export type Kind = "line" | "zone";
+export type Kind = "line" | "zone" | "mask";
 
-/** A line or zone while it is drawn or changed. */
+/** A line, zone or mask while it is drawn or changed. */
 export interface Draft {
   kind: Kind;
   /** The name it had; empty for a new one. */
@@ -16,25 +16,37 @@ export interface Draft {
   anchor: "foot" | "centre";
   loiter: string;
   capacity: string;
+  style: "fill" | "pixelate";
 }
 
 export interface Rules {
   lines: Line[];
   zones: Zone[];
+  masks: Mask[];
+}
+
+export function rulesOf(rules: Rules, kind: Kind): (Line | Zone | Mask)[] {
+  return kind === "line" ? rules.lines : kind === "zone" ? rules.zones : rules.masks;
 }
 
 export const leastPoints = (kind: Kind): number => (kind === "line" ? 2 : 3);
 export const MOST_POINTS = 32;
 
 export async function fetchRules(camera: string): Promise<Rules> {
-  const [{ lines }, { zones }] = await Promise.all([
+  const [{ lines }, { zones }, { masks }] = await Promise.all([
     ask<{ lines: Line[] }>(cameraPath(camera, "lines")),
     ask<{ zones: Zone[] }>(cameraPath(camera, "zones")),
+    ask<{ masks: Mask[] }>(cameraPath(camera, "masks")),
   ]);
-  return { lines, zones };
+  return { lines, zones, masks };
 }
 
-export function draftOf(kind: Kind, rule: Line | Zone): Draft {
+export function newDraft(kind: Kind, name: string): Draft {
+  const settings = { anchor: "foot", loiter: "", capacity: "", style: "fill" } as const;
+  return { kind, was: "", name, points: [], open: true, ...settings };
+}
+
+export function draftOf(kind: Kind, rule: Line | Zone | Mask): Draft {
   const zone = rule as Zone;
   return {
     kind,
@@ -42,18 +54,25 @@ export function draftOf(kind: Kind, rule: Line | Zone): Draft {
     name: rule.id,
     points: rule.points.map(([x, y]): Point => [x, y]),
     open: false,
-    anchor: rule.anchor ?? "foot",
+    anchor: zone.anchor ?? "foot",
     loiter: zone.loiter_s === undefined ? "" : String(zone.loiter_s),
     capacity: zone.capacity === undefined ? "" : String(zone.capacity),
+    style: (rule as Mask).style ?? "fill",
   };
+}
+
+function bodyOf({ kind, name: id, points, anchor, loiter, capacity, style }: Draft): Line | Zone | Mask {
+  if (kind === "mask") return { id, points, style };
+  const zone: Zone = { id, points, anchor };
+  if (kind === "zone" && loiter) zone.loiter_s = Number(loiter);
+  if (kind === "zone" && capacity) zone.capacity = Number(capacity);
+  return zone;
 }
 
 /** Saves a draft. Another name is another line: the old one goes once the new one is there. */
 export async function save(camera: string, draft: Draft): Promise<void> {
   const plural = `${draft.kind}s`;
-  const body: Zone = { id: draft.name, points: draft.points, anchor: draft.anchor };
-  if (draft.kind === "zone" && draft.loiter) body.loiter_s = Number(draft.loiter);
-  if (draft.kind === "zone" && draft.capacity) body.capacity = Number(draft.capacity);
+  const body = bodyOf(draft);
   if (draft.was === draft.name) {
     await ask(cameraPath(camera, plural, draft.name), "PUT", body);
     return;

@@ -3,14 +3,14 @@ import { useEffect } from "preact/hooks";
 import { ask, cameraPath, words, type Camera, type Counts } from "../api";
 import { Overlay } from "../draw/Overlay";
 import { RuleForm } from "../draw/RuleForm";
-import { draftOf, fetchRules, type Draft, type Kind, type Rules } from "../draw/rules";
+import { draftOf, fetchRules, newDraft, rulesOf, type Draft, type Kind, type Rules } from "../draw/rules";
 import { freeName } from "../draw/geometry";
 import { advice, number } from "../format";
 import { HeatMap } from "../live/HeatMap";
 import { LiveView } from "../live/LiveView";
 import type { Shown } from "../live/stage";
 import { go } from "../route";
-import { awake, cameras, mayEdit, refresh } from "../state";
+import { awake, cameras, mayEdit, mayHide, refresh } from "../state";
 import { EventList } from "../ui/EventList";
 import { State } from "../ui/State";
 import { CountChart } from "./CountChart";
@@ -19,9 +19,9 @@ import { DeleteCamera, EditCamera } from "./EditCamera";
 import { remember } from "./samples";
 
 const COUNT_MS = 1000;
-const NOTHING: Rules = { lines: [], zones: [] };
+const NOTHING: Rules = { lines: [], zones: [], masks: [] };
 
-/** One camera: its picture, its lines and zones, what they count, what happens. */
+/** One camera: its picture, its lines, zones and masks, what they count, what happens. */
 export function CameraPage({ id }: { id: string }) {
   const camera = cameras.value?.find((camera) => camera.id === id);
   if (cameras.value === null) return <p class="quiet">Looking for the camera…</p>;
@@ -84,11 +84,11 @@ function Open({ camera }: { camera: Camera }) {
   }, [id]);
 
   const begin = (kind: Kind) => {
-    const taken = (kind === "line" ? rules.value.lines : rules.value.zones).map((rule) => rule.id);
-    draft.value = { kind, was: "", name: freeName(kind, taken), points: [], open: true, anchor: "foot", loiter: "", capacity: "" };
+    const taken = rulesOf(rules.value, kind).map((rule) => rule.id);
+    draft.value = newDraft(kind, freeName(kind, taken));
   };
   const pick = (kind: Kind, name: string) => {
-    const rule = (kind === "line" ? rules.value.lines : rules.value.zones).find((rule) => rule.id === name);
+    const rule = rulesOf(rules.value, kind).find((rule) => rule.id === name);
     if (rule) draft.value = draftOf(kind, rule);
   };
   const done = () => {
@@ -150,6 +150,7 @@ function Open({ camera }: { camera: Camera }) {
               finish={() => (draft.value = now && { ...now, open: false })}
               cancel={done}
               pick={mayEdit.value ? pick : undefined}
+              pickMask={mayHide.value ? pick : undefined}
             />
           </LiveView>
           <div class="row tools">
@@ -161,6 +162,18 @@ function Open({ camera }: { camera: Camera }) {
                 <button type="button" class="main" disabled={now !== null} onClick={() => begin("zone")}>
                   Draw a zone
                 </button>
+              </>
+            )}
+            {mayHide.value && (
+              <>
+                <button type="button" disabled={now !== null} onClick={() => begin("mask")}>
+                  Hide a part
+                </button>
+                {rules.value.masks.map(({ id }) => (
+                  <button key={id} type="button" disabled={now !== null} aria-label={`Change mask ${id}`} onClick={() => pick("mask", id)}>
+                    {id}
+                  </button>
+                ))}
               </>
             )}
             <button type="button" aria-pressed={heat.value} onClick={() => (heat.value = !heat.value)}>
