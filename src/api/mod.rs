@@ -28,6 +28,7 @@ mod analytics;
 mod auth;
 mod cameras;
 mod drip;
+mod etag;
 mod events;
 mod extract;
 mod history;
@@ -50,7 +51,7 @@ use std::sync::Arc;
 
 use axum::Router;
 use axum::extract::DefaultBodyLimit;
-use axum::middleware::from_fn_with_state;
+use axum::middleware::{from_fn, from_fn_with_state};
 use axum::routing::{get, post};
 use prometheus::Registry;
 use tokio_rustls::rustls::ServerConfig;
@@ -180,6 +181,7 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
         .route("/readyz", get(rest::readyz))
         .route("/v1/session", get(auth::session).post(auth::sign_in).delete(auth::sign_out))
         .merge(page::routes())
+        .route_layer(from_fn(etag::tag))
         .route_layer(from_fn_with_state(state.clone(), auth::guard))
         .fallback(rest::no_such_path)
         .method_not_allowed_fallback(rest::no_such_method)

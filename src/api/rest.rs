@@ -1,6 +1,6 @@
 //! `/v1/cameras`, `/v1/webhooks`, health, metrics.
 
-use axum::extract::State;
+use axum::extract::{Query, State};
 use axum::http::{Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
@@ -12,14 +12,47 @@ use super::problem::Problem;
 use super::{ApiState, CameraPatch, CameraStatus, NewCamera, ssrf};
 use crate::auth::Identity;
 use crate::notify::{WebhookHandle, WebhookStatus};
+use crate::types::CameraId;
+
+/// Cameras in an answer at most: more than a service takes.
+const MAX_LIMIT: usize = 1024;
 
 #[derive(Serialize)]
 pub(super) struct CameraList {
     cameras: Vec<CameraStatus>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    next: Option<String>,
 }
 
-pub(super) async fn list(State(state): State<ApiState>) -> Json<CameraList> {
-    Json(CameraList { cameras: state.cameras.list() })
+/// `GET /v1/cameras?limit=&cursor=`: in the order of their names; without a limit all of them.
+pub(super) async fn list(
+    State(state): State<ApiState>,
+    Query(query): Query<Vec<(String, String)>>,
+) -> Result<Json<CameraList>, Problem> {
+    let (mut limit, mut after) = (usize::MAX, None);
+    for (key, value) in query {
+        let wrong = |what: &str| Problem::bad_request(format!("{key}={value:?} {what}"));
+        match key.as_str() {
+            "limit" => {
+                let given = value.parse().ok().filter(|n| (1..=MAX_LIMIT).contains(n));
+                limit = given.ok_or_else(|| wrong(&format!("must be a number from 1 to {MAX_LIMIT}")))?;
+            }
+            "cursor" => {
+                let id = CameraId::new(&value);
+                after = Some(id.map_err(|_| wrong("is no cursor: take `next` of the page before"))?);
+            }
+            _ => {
+                let there_are = "there are `limit` and `cursor`";
+                return Err(Problem::bad_request(format!("unknown parameter {key:?}; {there_are}")));
+            }
+        }
+    }
+    let mut cameras = state.cameras.list();
+    cameras.retain(|camera| after.as_ref().is_none_or(|after| camera.id > *after));
+    let more = cameras.len() > limit;
+    cameras.truncate(limit);
+    let next = cameras.last().filter(|_| more).map(|camera| camera.id.to_string());
+    Ok(Json(CameraList { cameras, next }))
 }
 
 #[derive(Serialize)]

@@ -30,6 +30,57 @@ async fn a_camera_is_added_shown_and_deleted() {
     server.stop().await;
 }
 
+#[tokio::test]
+async fn a_list_comes_in_pages() {
+    let server = Server::start().await;
+    for name in ["d", "b", "a", "c", "e"] {
+        server.cameras.put(name, "rtsp://host/x");
+    }
+    let (mut pages, mut path) = (vec![], "/v1/cameras?limit=2".to_owned());
+    loop {
+        let page = server.get(&path).await.json();
+        let cameras = page["cameras"].as_array().unwrap();
+        pages.push(cameras.iter().map(|c| c["id"].as_str().unwrap().to_owned()).collect::<String>());
+        match page["next"].as_str() {
+            Some(next) => path = format!("/v1/cameras?limit=2&cursor={next}"),
+            None => break,
+        }
+    }
+    assert_eq!(pages, ["ab", "cd", "e"]);
+    let all = server.get("/v1/cameras").await.json();
+    assert_eq!((all["cameras"].as_array().unwrap().len(), &all["next"]), (5, &serde_json::Value::Null));
+    assert_eq!(server.get("/v1/cameras?limit=5").await.json(), all);
+    for wrong in ["limit=0", "limit=x", "cursor=%20", "page=2"] {
+        assert_eq!(server.get(&format!("/v1/cameras?{wrong}")).await.status, 400, "{wrong}");
+    }
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn who_has_an_answer_already_is_told_so() {
+    let server = Server::start().await;
+    server.cameras.put("gate", "rtsp://host/x");
+    let first = server.get("/v1/cameras").await;
+    let tag = |head: &str| {
+        let line = head.lines().find_map(|line| line.strip_prefix("etag: "));
+        line.map(str::to_owned)
+    };
+    let known = tag(&first.head).expect("a tag");
+    let ask = async |tags: &str| server.request("GET", "/v1/cameras", &[("If-None-Match", tags)], b"").await;
+    for tags in [known.clone(), format!("\"other\", W/{known}")] {
+        let again = ask(&tags).await;
+        assert_eq!((again.status, again.text(), tag(&again.head)), (304, "", Some(known.clone())));
+    }
+    server.cameras.change("gate", |camera| camera.frames_in += 1);
+    let changed = ask(&known).await;
+    assert_eq!((changed.status, &changed.json()["cameras"][0]["frames_in"]), (200, &json!(11)));
+    assert_ne!(tag(&changed.head), Some(known));
+    // What is not JSON, and what is refused, has none.
+    assert_eq!(tag(&server.get("/metrics").await.head), None);
+    assert_eq!(tag(&server.get("/v1/cameras/nope").await.head), None);
+    server.stop().await;
+}
+
 /// Every error is a problem document with a kind for programs and a detail that names what was wrong.
 #[tokio::test]
 async fn errors_are_problem_documents() {

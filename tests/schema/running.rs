@@ -119,7 +119,16 @@ fn the_running_service_keeps_to_the_document() {
     try_out(&service, &document, &[&open[..], &fuzz, &only_tracks].concat(), &mut seen);
     let lasting = [&open[..], &fuzz, &ENDLESS, &["--exclude-operation-id", "removeCamera"]].concat();
     try_out(&service, &document, &lasting, &mut seen);
-    let passing = ["--include-tag", "cameras", "--include-tag", "lines and zones", "--max-examples", "10"];
+    let passing = [
+        "--include-tag",
+        "cameras",
+        "--include-tag",
+        "lines and zones",
+        "--include-tag",
+        "masks",
+        "--max-examples",
+        "10",
+    ];
     try_out(&service, &document, &[&open[..], &passing].concat(), &mut seen);
     assert_eq!(service.get("/readyz").status, 200);
     assert!(!service.stop().contains("panicked"));
