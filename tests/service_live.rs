@@ -31,3 +31,5 @@ mod server;
 mod support;
 #[path = "service/tracks.rs"]
 mod tracks;
+#[path = "service/truth.rs"]
+mod truth;

@@ -2,7 +2,7 @@
 //!
 //! Needs MOTChallenge data (`GAKP_SHARED`, or `../shared`), which is not part of the project.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use gakp::cli::eval;
 use gakp::mot::{Row, write_results};
@@ -13,19 +13,6 @@ use super::support::*;
 
 const SEQUENCE: &str = "TUD-Stadtmitte";
 const FRAMES: u64 = 179;
-
-/// The video and the folder of its truth; says so where they are missing.
-fn footage() -> Option<(PathBuf, PathBuf)> {
-    let shared = std::env::var_os("GAKP_SHARED")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from);
-    let video = shared.join(format!("data/video/{SEQUENCE}.mp4"));
-    let truth = shared.join(format!("data/MOT15/train/{SEQUENCE}"));
-    if video.is_file() && truth.is_dir() {
-        return Some((video, truth));
-    }
-    eprintln!("SKIPPED: no {}: set GAKP_SHARED to the folder that holds the data", video.display());
-    None
-}
 
 /// HOTA, MOTA and IDF1 of the rows in `folder/SEQUENCE.txt`.
 fn scores(truth: &Path, folder: &Path) -> [f64; 3] {
@@ -59,7 +46,7 @@ fn live_scores_are_the_offline_ones() {
     if models().is_none() {
         return;
     }
-    let Some((video, truth)) = footage() else { return };
+    let Some((video, truth)) = footage(SEQUENCE) else { return };
     let offline = tempfile::tempdir().unwrap();
     let file = offline.path().join(format!("{SEQUENCE}.txt"));
     let done = run_to_end(&["track", video.to_str().unwrap(), "--out", file.to_str().unwrap()], &[]);

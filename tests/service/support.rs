@@ -90,6 +90,19 @@ fn cut(film: &Path, part: &Path, frames: usize) {
     source.unwrap().stop();
 }
 
+/// The video of a sequence and the folder of its truth; says so where they are missing.
+pub fn footage(sequence: &str) -> Option<(PathBuf, PathBuf)> {
+    let shared = std::env::var_os("GAKP_SHARED")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from);
+    let video = shared.join(format!("data/video/{sequence}.mp4"));
+    let truth = shared.join(format!("data/MOT15/train/{sequence}"));
+    if video.is_file() && truth.is_dir() {
+        return Some((video, truth));
+    }
+    eprintln!("SKIPPED: no {}: set GAKP_SHARED to the folder that holds the data", video.display());
+    None
+}
+
 /// Waits until `so` gives something.
 #[track_caller]
 pub fn eventually<T>(what: &str, mut so: impl FnMut() -> Option<T>) -> T {
