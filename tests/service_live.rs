@@ -25,6 +25,8 @@ mod reload;
 mod rest;
 #[path = "service/scores.rs"]
 mod scores;
+#[path = "service/secrets.rs"]
+mod secrets;
 #[path = "postgres/server.rs"]
 mod server;
 #[path = "service/support.rs"]

@@ -37,7 +37,7 @@ pub fn film() -> Option<PathBuf> {
     needed(&film, "footage").then_some(film)
 }
 
-fn needed(file: impl AsRef<Path>, part: &str) -> bool {
+pub fn needed(file: impl AsRef<Path>, part: &str) -> bool {
     let (file, there) = (file.as_ref(), file.as_ref().exists());
     if !there {
         assert!(std::env::var_os("CI").is_none(), "{} is missing; CI must have it", file.display());
