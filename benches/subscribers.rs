@@ -17,7 +17,8 @@ use jiff::Timestamp;
 use support::{CameraProcess, Service};
 use tokio::net::{TcpSocket, TcpStream};
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
-use tokio_tungstenite::{WebSocketStream, client_async};
+use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
+use tokio_tungstenite::{WebSocketStream, client_async_with_config};
 
 /// Subscribers of the second phase, and those of them that do not read.
 const MANY: (usize, usize) = (200, 20);
@@ -52,21 +53,28 @@ async fn subscribe(address: SocketAddr, narrow: bool) -> WebSocketStream<TcpStre
         TcpStream::connect(address).await
     };
     let request = format!("ws://{address}/v1/tracks").into_client_request().expect("a request");
-    client_async(request, stream.expect("a connection")).await.expect("the handshake").0
+    // By default 128 KiB are cleared before each read.
+    let config = WebSocketConfig::default().read_buffer_size(8192);
+    let stream = stream.expect("a connection");
+    client_async_with_config(request, stream, Some(config)).await.expect("the handshake").0
 }
 
-/// Latencies, and how many gaps were told, until `end`.
+/// Latencies, and how many gaps were told, until `end`. Messages are looked into afterwards: 180 clients that parse
+/// on the service's cores would measure each other.
 async fn read(mut socket: WebSocketStream<TcpStream>, from: Instant, end: Instant) -> (Vec<f64>, usize) {
-    let (mut latencies, mut gaps) = (vec![], 0);
+    let mut messages = vec![];
     while let Ok(Some(Ok(message))) = tokio::time::timeout_at(end.into(), socket.next()).await {
-        let now = Timestamp::now();
+        messages.push((Instant::now(), Timestamp::now(), message));
+    }
+    let (mut latencies, mut gaps) = (vec![], 0);
+    for (at, now, message) in messages {
         let Ok(text) = message.to_text() else { continue };
         let Some((_, rest)) = text.split_once("\"capture_ts\":\"") else {
             gaps += usize::from(text.contains("\"gap\""));
             continue;
         };
         let captured: Timestamp = rest.split('"').next().expect("a time").parse().expect("a time");
-        if Instant::now() >= from {
+        if at >= from {
             latencies.push(now.duration_since(captured).as_secs_f64());
         }
     }

@@ -26,6 +26,8 @@ pub(super) const SEND_TIMEOUT: Duration = Duration::from_secs(10);
 const CLOSE_TIMEOUT: Duration = Duration::from_millis(500);
 /// Longest message taken from a client: none is expected, pongs have at most 125 bytes.
 const MAX_INCOMING: usize = 4096;
+/// Bytes that are read at a time; clients send little.
+const READ_BUFFER: usize = 2048;
 
 /// How a WebSocket finds out that its client is gone.
 #[derive(Clone, Copy, Debug)]
@@ -120,7 +122,11 @@ impl FromRequestParts<ApiState> for Opening {
                 "a browser may open this WebSocket only from a page of this service",
             ));
         }
-        let upgrade = upgrade.max_message_size(MAX_INCOMING).max_frame_size(MAX_INCOMING);
+        let upgrade = upgrade
+            .max_message_size(MAX_INCOMING)
+            .max_frame_size(MAX_INCOMING)
+            // The library clears as much whenever it looks whether something came: at each message that is sent.
+            .read_buffer_size(READ_BUFFER);
         let ticket = Ticket::from_request_parts(parts, state).await?;
         Ok(Self { upgrade, keep_alive: state.sockets.keep_alive, ticket })
     }
