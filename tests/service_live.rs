@@ -35,3 +35,5 @@ mod support;
 mod tracks;
 #[path = "service/truth.rs"]
 mod truth;
+#[path = "service/typescript.rs"]
+mod typescript;

@@ -49,9 +49,19 @@ pub struct Socket {
 
 impl Socket {
     pub fn open(stream: TcpStream, address: SocketAddr, path: &str, protocol: Option<&str>) -> Self {
+        let header = protocol.map(|protocol| ("sec-websocket-protocol", protocol));
+        Self::open_with(stream, address, path, header)
+    }
+
+    pub fn open_with(
+        stream: TcpStream,
+        address: SocketAddr,
+        path: &str,
+        header: Option<(&'static str, &str)>,
+    ) -> Self {
         let mut request = format!("ws://{address}{path}").into_client_request().unwrap();
-        if let Some(protocol) = protocol {
-            request.headers_mut().insert("sec-websocket-protocol", protocol.parse().unwrap());
+        if let Some((name, value)) = header {
+            request.headers_mut().insert(name, value.parse().unwrap());
         }
         let (socket, _) = tungstenite::client(request, stream).expect("the handshake");
         Self { socket }

@@ -1,4 +1,4 @@
-//! The clients that gakp ships, against the running service.
+//! The Python client that gakp ships, against the running service.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 use super::support::*;
 
 /// The tests' own Python; `None`, said loudly, without the set-up. Where the environment has `CI` that is a failure.
-fn python() -> Option<PathBuf> {
+pub fn python() -> Option<PathBuf> {
     let python = Path::new(env!("CARGO_MANIFEST_DIR")).join(".venv-tests/bin/python");
     if !python.exists() {
         assert!(std::env::var_os("CI").is_none(), "{} is missing; CI must have it", python.display());

@@ -358,6 +358,12 @@ impl Service {
         Socket::open(connect(self.address), self.address, path, None)
     }
 
+    /// By the bearer of a token.
+    pub fn socket_as(&self, token: &str, path: &str) -> Socket {
+        let bearer = format!("Bearer {token}");
+        Socket::open_with(connect(self.address), self.address, path, Some(("authorization", &bearer)))
+    }
+
     pub fn protobuf_socket(&self, path: &str) -> Socket {
         Socket::open(connect(self.address), self.address, path, Some("gakp.v1.protobuf"))
     }
