@@ -9,7 +9,8 @@ export default defineConfig({
   workers: 1,
   timeout: 180_000,
   expect: { timeout: 30_000 },
-  reporter: "line",
+  // With how long each step takes.
+  reporter: [["list", { printSteps: true }]],
   forbidOnly: true,
   use: {
     baseURL: process.env.GAKP_URL,
