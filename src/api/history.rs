@@ -36,9 +36,7 @@ const MAX_BUCKET: i64 = 31 * 86_400;
 const NS: i64 = 1_000_000_000;
 
 fn database(state: &ApiState) -> Result<&Database, Problem> {
-    state.history.as_ref().ok_or_else(|| {
-        Problem::unavailable("no history is kept: `[history] database` of the configuration is \"none\"")
-    })
+    state.history.as_ref().ok_or_else(Problem::no_history)
 }
 
 impl From<HistoryError> for Problem {

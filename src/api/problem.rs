@@ -47,7 +47,7 @@ impl Problem {
     }
 
     pub fn unknown_rule(detail: impl Into<String>) -> Self {
-        Self::new(StatusCode::NOT_FOUND, "unknown-rule", "No such line or zone", detail)
+        Self::new(StatusCode::NOT_FOUND, "unknown-rule", "No such line, zone or mask", detail)
     }
 
     pub fn method_not_allowed(detail: impl Into<String>) -> Self {
@@ -82,6 +82,11 @@ impl Problem {
         Self::new(StatusCode::SERVICE_UNAVAILABLE, "unavailable", "Not available now", detail)
     }
 
+    pub fn no_history() -> Self {
+        let why = "no history is kept: `[history] database` of the configuration is \"none\"";
+        Self::new(StatusCode::SERVICE_UNAVAILABLE, "no-history", "No history is kept", why)
+    }
+
     pub fn internal(detail: impl Into<String>) -> Self {
         Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", "The service failed", detail)
     }
@@ -113,7 +118,7 @@ impl From<EditError> for Problem {
         match error {
             EditError::Rule(_) => Self::bad_request(detail),
             EditError::Exists(_) => {
-                Self::new(StatusCode::CONFLICT, "rule-exists", "Line or zone exists", detail)
+                Self::new(StatusCode::CONFLICT, "rule-exists", "The name is taken", detail)
             }
             EditError::Unknown { .. } => Self::unknown_rule(detail),
         }

@@ -99,6 +99,7 @@ async fn errors_are_problem_documents() {
         ("GET", "/v1/cameras/gate/snapshot.jpg?annotate=1", json_type, "", 400, "bad-request", "annotate"),
         ("GET", "/v1/cameras/gate/stream.mjpeg?x=1", json_type, "", 400, "bad-request", "\"x\""),
         ("GET", "/v1/tracks", json_type, "", 426, "websocket-only", "WebSocket"),
+        ("GET", "/v1/history/tracks", json_type, "", 503, "no-history", "\"none\""),
         ("GET", "/nowhere", json_type, "", 404, "not-found", "/nowhere"),
         ("PUT", "/v1/cameras", json_type, "", 405, "method-not-allowed", "PUT"),
         (

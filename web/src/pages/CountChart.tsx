@@ -65,7 +65,7 @@ export function CountChart({ camera, rules }: { camera: string; rules: Rules }) 
           return;
         } catch (problem) {
           if (gone) return;
-          history = !(problem instanceof ApiError && [404, 503].includes(problem.status));
+          history = !(problem instanceof ApiError && ["no-history", "not-found"].includes(problem.kind));
           if (history) {
             note.value = words(problem);
             return;

@@ -63,7 +63,7 @@ export function History() {
       missing.value = false;
       searched.value = true;
     } catch (error) {
-      missing.value = error instanceof ApiError && (error.status === 503 || error.kind === "not-found");
+      missing.value = error instanceof ApiError && ["no-history", "not-found"].includes(error.kind);
       problem.value = words(error);
     } finally {
       busy.value = false;

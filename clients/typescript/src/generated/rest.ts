@@ -1447,7 +1447,7 @@ export interface components {
                 "application/problem+json": components["schemas"]["Problem"];
             };
         };
-        /** @description No history is kept, or its database does not answer. */
+        /** @description No history is kept (`no-history`), or its database does not answer now (`unavailable`). */
         NoHistory: {
             headers: {
                 [name: string]: unknown;
@@ -1456,7 +1456,7 @@ export interface components {
                 "application/problem+json": components["schemas"]["Problem"];
             };
         };
-        /** @description There is no such camera, or no such line or zone on it. */
+        /** @description There is no such camera, or no such line, zone or mask on it. */
         UnknownRule: {
             headers: {
                 [name: string]: unknown;
