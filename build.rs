@@ -6,7 +6,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     println!("cargo:rerun-if-changed=build.rs");
     #[cfg(feature = "service")]
     {
-        let schema = protox::compile(["tracks.proto"], ["proto"])?;
+        let schema = protox::compile(["service.proto"], ["proto"])?;
         prost_build::Config::new().compile_fds(schema)?;
         page::gather()?;
     }

@@ -1,8 +1,12 @@
-//! The HTTP and WebSocket edge, against a real server in this process with cameras that are made up.
+//! The HTTP, WebSocket and gRPC edge, against a real server in this process with cameras that are made up.
 #![cfg(feature = "service")]
 
 #[path = "api/auth.rs"]
 mod auth;
+#[path = "api/grpc.rs"]
+mod grpc;
+#[path = "grpc/client.rs"]
+mod grpc_client;
 #[path = "api/rest.rs"]
 mod rest;
 #[path = "api/rules.rs"]

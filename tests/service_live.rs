@@ -11,6 +11,10 @@ mod clients;
 mod ending;
 #[path = "service/failures.rs"]
 mod failures;
+#[path = "service/grpc.rs"]
+mod grpc;
+#[path = "grpc/client.rs"]
+mod grpc_client;
 #[path = "service/history.rs"]
 mod history;
 #[path = "service/masks.rs"]

@@ -21,7 +21,7 @@ const CHANGE: Right = Right::Role(Role::Operator);
 const ADMIN: Right = Right::Role(Role::Admin);
 
 /// What each route asks for. One that is not here asks for an admin. `HEAD` asks for what `GET` does.
-pub const RIGHTS: [(&str, &str, Right); 50] = [
+pub const RIGHTS: [(&str, &str, Right); 51] = [
     ("GET", "/v1/cameras", VIEW),
     ("POST", "/v1/cameras", CHANGE),
     ("GET", "/v1/cameras/{id}", VIEW),
@@ -49,6 +49,7 @@ pub const RIGHTS: [(&str, &str, Right); 50] = [
     ("GET", "/v1/cameras/{id}/heatmap", VIEW),
     ("GET", "/v1/tracks", VIEW),
     ("GET", "/v1/tracks/stream", VIEW),
+    ("POST", "/gakp.v1.Tracks/Subscribe", VIEW),
     ("GET", "/v1/events", VIEW),
     ("GET", "/v1/events/live", VIEW),
     ("GET", "/v1/history", VIEW),

@@ -33,7 +33,11 @@ async fn feed(mut parts: impl Parts, sender: mpsc::Sender<Bytes>, mut ticket: Ti
             () = ticket.stop.stopped() => return,
             room = timeout(SEND_TIMEOUT, sender.reserve()) => room,
         };
-        let Ok(Ok(room)) = room else { return };
+        let room = match room {
+            Ok(Ok(room)) => room,
+            Ok(Err(_)) => return,
+            Err(_) => return ticket.give_up(),
+        };
         let part = tokio::select! {
             () = ticket.stop.stopped() => return,
             () = sender.closed() => return,

@@ -1,4 +1,4 @@
-//! The HTTP and WebSocket edge: cameras over REST, live tracks, live video, health, metrics, the page.
+//! The HTTP, WebSocket and gRPC edge: cameras over REST, live tracks, live video, health, metrics, the page.
 //!
 //! ```text
 //! /                                the web page
@@ -13,6 +13,7 @@
 //! /v1/session                      who asks; signing in and out
 //! /v1/tracks                       WebSocket: tracks as JSON or protobuf
 //! /v1/tracks/stream                the same as Server-Sent Events
+//! /gakp.v1.Tracks/Subscribe        the same over gRPC
 //! /v1/events[/live]                what happened at lines and in zones; a WebSocket of it
 //! /v1/history[/...]                tracks and events that were; counts over time; CSV, MOTChallenge
 //! /v1/webhooks                     how webhooks fare
@@ -31,7 +32,9 @@ mod drip;
 mod etag;
 mod events;
 mod extract;
+mod grpc;
 mod history;
+mod http2;
 mod live;
 mod object;
 mod openapi;
@@ -161,6 +164,7 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
         .route("/v1/cameras/{id}/heatmap", get(analytics::heat_map))
         .route("/v1/tracks", get(tracks::tracks))
         .route("/v1/tracks/stream", get(tracks::stream))
+        .route("/gakp.v1.Tracks/Subscribe", post(grpc::subscribe))
         .route("/v1/events", get(events::recent))
         .route("/v1/events/live", get(events::live))
         .route("/v1/history", get(history::summary))
@@ -186,5 +190,6 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
         .fallback(rest::no_such_path)
         .method_not_allowed_fallback(rest::no_such_method)
         .layer(DefaultBodyLimit::max(MAX_BODY_BYTES))
+        .layer(from_fn(grpc::translate))
         .with_state(state)
 }

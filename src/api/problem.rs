@@ -9,7 +9,7 @@ use super::{CameraError, EditError};
 use crate::types::CameraIdError;
 
 /// An error as the client sees it: `application/problem+json` with `type`, `title`, `status`, `detail`.
-#[derive(Debug, Serialize)]
+#[derive(Clone, Debug, Serialize)]
 pub(super) struct Problem {
     /// Names the kind of problem; explained in docs/api.md under its last part.
     #[serde(rename = "type")]
@@ -66,6 +66,10 @@ impl Problem {
         Self::new(StatusCode::UPGRADE_REQUIRED, "websocket-only", "This path speaks WebSocket", detail)
     }
 
+    pub fn http2_only(detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::UPGRADE_REQUIRED, "http2-only", "This path speaks gRPC over HTTP/2", detail)
+    }
+
     pub fn unauthenticated(detail: impl Into<String>) -> Self {
         Self::new(StatusCode::UNAUTHORIZED, "unauthenticated", "A token is needed", detail)
     }
@@ -92,6 +96,18 @@ impl Problem {
     }
 }
 
+impl Problem {
+    /// The status, and the words.
+    pub fn parts(&self) -> (StatusCode, &str) {
+        (self.status, &self.detail)
+    }
+
+    /// Whether it is that there is no such camera.
+    pub fn is_unknown_camera(&self) -> bool {
+        self.kind.ends_with(":unknown-camera")
+    }
+}
+
 impl IntoResponse for Problem {
     fn into_response(self) -> Response {
         let mut response = (self.status, Json(&self)).into_response();
@@ -102,6 +118,12 @@ impl IntoResponse for Problem {
             let scheme = HeaderValue::from_static("Bearer realm=\"gakp\"");
             response.headers_mut().insert(header::WWW_AUTHENTICATE, scheme);
         }
+        if self.kind.ends_with(":http2-only") {
+            // RFC 9110, section 15.5.22.
+            response.headers_mut().insert(header::UPGRADE, HeaderValue::from_static("HTTP/2.0"));
+        }
+        // gRPC tells it in another way.
+        response.extensions_mut().insert(self);
         response
     }
 }

@@ -16,16 +16,16 @@ use tokio::time::{sleep, timeout};
 use tokio_rustls::TlsAcceptor;
 
 use super::socket::{KeepAlive, Sockets};
-use super::{ApiConfig, router};
+use super::{ApiConfig, http2, router};
 
 /// Plain HTTP connections at a time, WebSockets not among them. More wait in the kernel's backlog.
 const MAX_CONNECTIONS: usize = 512;
 /// Longest head of a request, bytes.
-const MAX_HEAD: usize = 32 * 1024;
+pub(super) const MAX_HEAD: usize = 32 * 1024;
 /// How long a connection may take to send a request's head, and to sit idle between requests.
-const HEADER_TIMEOUT: Duration = Duration::from_secs(15);
+pub(super) const HEADER_TIMEOUT: Duration = Duration::from_secs(15);
 /// How long sent bytes may stay unacknowledged before the peer counts as dead.
-const PEER_TIMEOUT: Duration = Duration::from_secs(20);
+pub(super) const PEER_TIMEOUT: Duration = Duration::from_secs(20);
 /// Bytes that may wait in the kernel beyond what the network has under way. More would be handed to
 /// a slow client long after it was news, and the hub, which keeps the newest, would not notice.
 #[cfg(target_os = "linux")]
@@ -118,19 +118,47 @@ async fn connection(stream: TcpStream, tls: Option<TlsAcceptor>, router: Router,
         let _ = socket.set_tcp_user_timeout(Some(PEER_TIMEOUT));
         let _ = socket.set_tcp_notsent_lowat(UNSENT);
     }
-    let Some(tls) = tls else { return converse(stream, router, stop).await };
+    let Some(tls) = tls else {
+        let begun = tokio::select! {
+            begun = timeout(HEADER_TIMEOUT, begins_http2(&stream)) => begun,
+            () = stop.stopped() => return,
+        };
+        return match begun {
+            Ok(Ok(true)) => http2::converse(stream, router, stop).await,
+            Ok(Ok(false)) => converse(stream, router, stop).await,
+            Ok(Err(error)) => tracing::debug!(%error, "a connection ended early"),
+            Err(_) => tracing::debug!("a connection was opened and not used"),
+        };
+    };
     let shaken = tokio::select! {
         shaken = timeout(HEADER_TIMEOUT, tls.accept(stream)) => shaken,
         () = stop.stopped() => return,
     };
     match shaken {
+        Ok(Ok(stream)) if stream.get_ref().1.alpn_protocol() == Some(b"h2") => {
+            http2::converse(stream, router, stop).await;
+        }
         Ok(Ok(stream)) => converse(stream, router, stop).await,
         Ok(Err(error)) => tracing::debug!(%error, "a TLS handshake failed"),
         Err(_) => tracing::debug!("a TLS handshake took too long"),
     }
 }
 
-/// Requests and answers over one connection.
+/// Whether a client begins as HTTP/2 does, `PRI * HTTP/2.0`; no method of HTTP/1 begins so. Nothing is taken.
+async fn begins_http2(stream: &TcpStream) -> io::Result<bool> {
+    const PREFACE: &[u8] = b"PRI";
+    let mut start = [0; PREFACE.len()];
+    loop {
+        let n = stream.peek(&mut start).await?;
+        if n == 0 || n == PREFACE.len() || start[..n] != PREFACE[..n] {
+            return Ok(start[..n] == *PREFACE);
+        }
+        // One or two bytes of three: they stay readable, so nothing tells when there are more.
+        sleep(Duration::from_millis(10)).await;
+    }
+}
+
+/// Requests and answers over one connection of HTTP/1.
 async fn converse(
     stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
     router: Router,

@@ -14,14 +14,17 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::ApiState;
+use super::http2::Cut;
 use super::problem::Problem;
 use super::server::Stop;
 use crate::auth::{Gate, Identity};
 
-/// Long-lived streams at a time (WebSockets and MJPEG).
+/// Long-lived streams at a time (WebSockets, Server-Sent Events, gRPC, MJPEG).
 const MAX_STREAMS: usize = 256;
 /// A peer that takes no byte for so long is gone.
 pub(super) const SEND_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long what was last said waits for a peer that took nothing for [`SEND_TIMEOUT`].
+const LAST_WORD: Duration = Duration::from_secs(10);
 /// How long a closing peer has to answer.
 const CLOSE_TIMEOUT: Duration = Duration::from_millis(500);
 /// Longest message taken from a client: none is expected, pongs have at most 125 bytes.
@@ -89,6 +92,17 @@ pub(super) struct Ticket {
     _seat: OwnedSemaphorePermit,
     pub pass: Pass,
     pub stop: Stop,
+    cut: Option<Cut>,
+}
+
+impl Ticket {
+    /// Gives up a client that takes nothing any more. It has a last while to hear why; then what still waits for it is
+    /// dropped. A stream of HTTP/1 ends with its connection, which the kernel gives up.
+    pub fn give_up(self) {
+        if let Some(cut) = self.cut {
+            cut.after(LAST_WORD);
+        }
+    }
 }
 
 impl FromRequestParts<ApiState> for Ticket {
@@ -97,7 +111,7 @@ impl FromRequestParts<ApiState> for Ticket {
     async fn from_request_parts(parts: &mut Parts, state: &ApiState) -> Result<Self, Problem> {
         let identity = parts.extensions.get::<Option<Identity>>().cloned().flatten();
         let pass = Pass { gate: state.gate.clone(), identity };
-        Ok(Self { _seat: state.seats.take()?, pass, stop: state.sockets.stop.clone() })
+        Ok(Self { _seat: state.seats.take()?, pass, stop: state.sockets.stop.clone(), cut: Cut::current() })
     }
 }
 
@@ -173,7 +187,7 @@ pub(super) trait Outgoing: Send {
 
 /// Sends what `outgoing` has until it ends, the peer goes, or the service stops.
 async fn run(socket: WebSocket, keep_alive: KeepAlive, ticket: Ticket, mut outgoing: impl Outgoing) {
-    let Ticket { _seat, pass, mut stop } = ticket;
+    let Ticket { _seat, pass, mut stop, .. } = ticket;
     let (mut sender, mut receiver) = socket.split();
     let mut ping = interval(keep_alive.ping_every);
     ping.set_missed_tick_behavior(MissedTickBehavior::Delay);

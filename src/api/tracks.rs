@@ -57,7 +57,7 @@ pub(super) async fn stream(
 }
 
 /// Which cameras, and what of their reports.
-fn wishes(state: &ApiState, query: &[(String, String)]) -> Result<(Only, TrackFilter), Problem> {
+pub(super) fn wishes(state: &ApiState, query: &[(String, String)]) -> Result<(Only, TrackFilter), Problem> {
     let (mut cameras, mut filter) = (BTreeSet::new(), TrackFilter::default());
     for (key, value) in query {
         let wrong = |what: String| Err(Problem::bad_request(format!("{key}={value:?} {what}")));
@@ -97,19 +97,19 @@ fn wishes(state: &ApiState, query: &[(String, String)]) -> Result<(Only, TrackFi
 }
 
 #[derive(Clone, Copy)]
-enum Format {
+pub(super) enum Format {
     Json,
     Protobuf,
 }
 
 /// A message to a subscriber.
-enum Told {
+pub(super) enum Told {
     Tracks(Bytes),
     Gap(Bytes),
 }
 
 /// One subscriber's messages, encoded.
-struct Messages {
+pub(super) struct Messages {
     subscription: Subscription,
     sieve: Sieve,
     format: Format,
@@ -117,13 +117,18 @@ struct Messages {
 }
 
 impl Messages {
-    fn new(state: &ApiState, only: Only, filter: TrackFilter, format: Format) -> Self {
+    pub fn new(state: &ApiState, only: Only, filter: TrackFilter, format: Format) -> Self {
         let (subscription, classes) = (state.hub.subscribe(only), state.hub.classes().clone());
         Self { subscription, sieve: Sieve::new(filter), format, classes }
     }
 
+    /// Whether it ended because it missed too much.
+    pub fn given_up(&self) -> bool {
+        self.subscription.given_up()
+    }
+
     /// Cancel safe: what was taken from the hub is told before anything is awaited again.
-    async fn next(&mut self) -> Option<Told> {
+    pub async fn next(&mut self) -> Option<Told> {
         loop {
             let report = match self.subscription.next().await? {
                 Event::Tracks(report) => report,
@@ -145,6 +150,9 @@ impl Messages {
     }
 }
 
+/// What one is told that the hub gave up.
+pub(super) const GIVEN_UP: &str = "too slow: missed more than can be accounted for";
+
 struct TrackSocket(Messages);
 
 impl Outgoing for TrackSocket {
@@ -157,8 +165,8 @@ impl Outgoing for TrackSocket {
     }
 
     fn farewell(&self) -> (u16, &'static str) {
-        if self.0.subscription.given_up() {
-            (close_code::POLICY, "too slow: missed more than can be accounted for")
+        if self.0.given_up() {
+            (close_code::POLICY, GIVEN_UP)
         } else {
             (close_code::AWAY, "the service stops")
         }

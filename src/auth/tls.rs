@@ -58,7 +58,7 @@ impl Certificates {
         Ok(())
     }
 
-    /// The server's side of TLS 1.2 and 1.3, HTTP/1.1.
+    /// The server's side of TLS 1.2 and 1.3, HTTP/2 and HTTP/1.1.
     ///
     /// # Errors
     /// [`TlsError::Pair`].
@@ -67,7 +67,7 @@ impl Certificates {
             .with_safe_default_protocol_versions()?
             .with_no_client_auth()
             .with_cert_resolver(self.clone());
-        config.alpn_protocols = vec![b"http/1.1".to_vec()];
+        config.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
         Ok(Arc::new(config))
     }
 }

@@ -18,13 +18,13 @@ use tokio_rustls::rustls::{ClientConfig, RootCertStore};
 use super::support::*;
 
 /// A token of each role without pictures, one of a viewer with them.
-struct Tokens {
-    folder: tempfile::TempDir,
+pub struct Tokens {
+    pub folder: tempfile::TempDir,
     all: Vec<(String, String)>,
 }
 
 impl Tokens {
-    fn new() -> Self {
+    pub fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let mut file = TokenFile::default();
         let mut make = |name: &str, role, video| {
@@ -40,11 +40,11 @@ impl Tokens {
         Self { folder, all }
     }
 
-    fn gate(&self) -> Gate {
+    pub fn gate(&self) -> Gate {
         Gate::new(TokenFile::path(self.folder.path()), true).unwrap()
     }
 
-    fn bearer(&self, name: &str) -> String {
+    pub fn bearer(&self, name: &str) -> String {
         format!("Bearer {}", self.all.iter().find(|(n, _)| n == name).unwrap().1)
     }
 }

@@ -1,27 +1,10 @@
 //! The Python client that gakp ships, against the running service.
 
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::path::Path;
 
+use super::grpc_client::{python, run};
 use super::support::*;
-
-/// The tests' own Python; `None`, said loudly, without the set-up. Where the environment has `CI` that is a failure.
-pub fn python() -> Option<PathBuf> {
-    let python = Path::new(env!("CARGO_MANIFEST_DIR")).join(".venv-tests/bin/python");
-    if !python.exists() {
-        assert!(std::env::var_os("CI").is_none(), "{} is missing; CI must have it", python.display());
-        eprintln!("SKIPPED: {} is missing: run `bash deploy/setup.sh test-packages`", python.display());
-        return None;
-    }
-    Some(python)
-}
-
-fn run(python: &Path, args: &[&str]) -> Output {
-    let mut command = Command::new(python);
-    command.current_dir(env!("CARGO_MANIFEST_DIR")).env("PYTHONDONTWRITEBYTECODE", "1").env("NO_PROXY", "*");
-    command.args(args).output().unwrap()
-}
 
 #[test]
 fn the_python_client_sees_what_is_sent() {

@@ -13,7 +13,7 @@ use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::tungstenite::protocol::{CloseFrame, WebSocket};
 use tokio_tungstenite::tungstenite::{self, Message};
 
-use super::clients::python;
+use super::grpc_client::python;
 use super::support::*;
 
 fn folder() -> PathBuf {

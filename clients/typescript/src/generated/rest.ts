@@ -406,6 +406,26 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/gakp.v1.Tracks/Subscribe": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        /**
+         * Tracks (gRPC)
+         * @description The messages of `/v1/tracks` as protobuf, over gRPC: `proto/service.proto` describes request and messages, a gRPC client makes the call, and its errors are gRPC statuses. What is described here is what a client hears that speaks HTTP/1.1 or no gRPC.
+         */
+        post: operations["subscribe"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/v1/events": {
         parameters: {
             query?: never;
@@ -1504,6 +1524,17 @@ export interface components {
         /** @description The request does not open a WebSocket. */
         WebSocketOnly: {
             headers: {
+                [name: string]: unknown;
+            };
+            content: {
+                "application/problem+json": components["schemas"]["Problem"];
+            };
+        };
+        /** @description The call does not come over HTTP/2. */
+        Http2Only: {
+            headers: {
+                /** @description `HTTP/2.0`. */
+                Upgrade: "HTTP/2.0";
                 [name: string]: unknown;
             };
             content: {
@@ -2780,6 +2811,36 @@ export interface operations {
             403: components["responses"]["Forbidden"];
             404: components["responses"]["UnknownCamera"];
             503: components["responses"]["TooManyStreams"];
+        };
+    };
+    subscribe: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /** @description A `gakp.v1.SubscribeRequest` in gRPC's framing. */
+        requestBody?: {
+            content: {
+                "application/grpc": string;
+            };
+        };
+        responses: {
+            /** @description `gakp.v1.TrackMessage`s in gRPC's framing, over HTTP/2 alone. It does not end by itself. */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/grpc": string;
+                };
+            };
+            401: components["responses"]["Unauthenticated"];
+            403: components["responses"]["Forbidden"];
+            413: components["responses"]["TooLarge"];
+            415: components["responses"]["MediaType"];
+            426: components["responses"]["Http2Only"];
         };
     };
     events: {
