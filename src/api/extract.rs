@@ -1,15 +1,21 @@
 //! What handlers take from a request; what is wrong with it is answered with a problem document.
 
+use std::time::Duration;
+
 use axum::body::Bytes;
 use axum::extract::{FromRequest, FromRequestParts, Request};
 use axum::http::request::Parts;
 use axum::http::{StatusCode, header};
 use serde::de::DeserializeOwned;
+use tokio::time::timeout;
 
 use super::object::Object;
 use super::problem::Problem;
 use super::{ApiState, MAX_BODY_BYTES};
 use crate::types::CameraId;
+
+/// How long a body may take to arrive.
+const BODY_TIMEOUT: Duration = Duration::from_secs(15);
 
 /// What the path names. Unlike axum's own it answers a path that is no UTF-8 with a problem document.
 pub(super) struct Path<T>(pub T);
@@ -38,8 +44,12 @@ impl<T: DeserializeOwned, S: Send + Sync> FromRequest<S> for JsonBody<T> {
         if !media_type.split(';').next().unwrap_or("").trim().eq_ignore_ascii_case("application/json") {
             return Err(Problem::media_type("send the body as `Content-Type: application/json`"));
         }
-        let body =
-            Bytes::from_request(request, state).await.map_err(|rejection| match rejection.status() {
+        let body = timeout(BODY_TIMEOUT, Bytes::from_request(request, state))
+            .await
+            .map_err(|_| {
+                Problem::bad_request(format!("the body did not arrive within {} s", BODY_TIMEOUT.as_secs()))
+            })?
+            .map_err(|rejection| match rejection.status() {
                 StatusCode::PAYLOAD_TOO_LARGE => {
                     Problem::too_large(format!("a body may have at most {MAX_BODY_BYTES} bytes"))
                 }

@@ -1,5 +1,6 @@
 //! What every WebSocket here has in common: who may open one, keep-alive, slow and dead peers, closing.
 
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -192,10 +193,11 @@ async fn run(socket: WebSocket, keep_alive: KeepAlive, ticket: Ticket, mut outgo
     let mut ping = interval(keep_alive.ping_every);
     ping.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut heard = Instant::now();
+    let mut stopped = pin!(stop.stopped());
     let (code, reason) = loop {
         let message = tokio::select! {
             biased;
-            () = stop.stopped() => break (close_code::AWAY, "the service stops"),
+            () = &mut stopped => break (close_code::AWAY, "the service stops"),
             incoming = receiver.next() => match incoming {
                 // The library answers pings and closes by itself.
                 Some(Ok(Message::Close(_)) | Err(_)) | None => return,
@@ -219,13 +221,14 @@ async fn run(socket: WebSocket, keep_alive: KeepAlive, ticket: Ticket, mut outgo
             },
         };
         tokio::select! {
+            biased;
             sent = timeout(SEND_TIMEOUT, sender.send(message)) => {
                 if !matches!(sent, Ok(Ok(()))) {
                     return;
                 }
             }
             // In the middle of a message there is no saying goodbye.
-            () = stop.stopped() => return,
+            () = &mut stopped => return,
         }
     };
     let _ = timeout(CLOSE_TIMEOUT, close(&mut sender, &mut receiver, code, reason)).await;

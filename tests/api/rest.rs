@@ -31,6 +31,16 @@ async fn a_camera_is_added_shown_and_deleted() {
 }
 
 #[tokio::test]
+async fn a_body_that_never_comes_is_not_waited_for() {
+    let server = Server::start().await;
+    let headers = [("Content-Type", "application/json"), ("Content-Length", "10")];
+    let answer = server.request("POST", "/v1/cameras", &headers, b"").await;
+    assert_eq!(answer.status, 400);
+    assert!(answer.text().contains("did not arrive"), "{}", answer.text());
+    server.stop().await;
+}
+
+#[tokio::test]
 async fn a_list_comes_in_pages() {
     let server = Server::start().await;
     for name in ["d", "b", "a", "c", "e"] {
