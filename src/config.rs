@@ -15,6 +15,7 @@ use crate::detect::DetectorSettings;
 use crate::history::{HistorySettings, Place};
 use crate::infer::ModelSettings;
 use crate::notify::{MqttOptions, NotifyError, NotifyPlan, WebhookOptions};
+use crate::traces::{TracesError, TracesOptions, TracesPlan};
 use crate::track::{Association, PairScore, TrackerConfig};
 use crate::tuning::Tuning;
 
@@ -48,6 +49,8 @@ pub struct Config {
     pub webhooks: Vec<WebhookOptions>,
     /// The broker that is told what happens.
     pub mqtt: Option<MqttOptions>,
+    /// Where traces are exported to.
+    pub traces: Option<TracesOptions>,
     /// Where it was read from: files that it names are looked for there.
     #[serde(skip)]
     folder: PathBuf,
@@ -195,6 +198,7 @@ impl Config {
             tracker,
             webhooks,
             mqtt,
+            traces,
             cameras: _,
             folder: _,
         } = self;
@@ -210,6 +214,7 @@ impl Config {
             ("tracker", *tracker == other.tracker),
             ("webhook", *webhooks == other.webhooks),
             ("mqtt", *mqtt == other.mqtt),
+            ("traces", *traces == other.traces),
         ];
         settings.into_iter().filter(|(_, same)| !same).map(|(name, _)| name.to_owned()).collect()
     }
@@ -262,6 +267,15 @@ impl Config {
             webhooks: WebhookOptions::check_all(std::mem::take(&mut self.webhooks), &self.folder)?,
             mqtt: self.mqtt.take().map(|mqtt| mqtt.check(&self.folder)).transpose()?,
         })
+    }
+
+    /// Takes out which traces are exported where, checked; `None` when none are. Reads the files that hold secrets,
+    /// and OpenTelemetry's variables of the environment.
+    ///
+    /// # Errors
+    /// A setting is wrong, or its file cannot be read.
+    pub fn take_traces(&mut self) -> Result<Option<TracesPlan>, TracesError> {
+        TracesOptions::check(self.traces.take(), &self.folder, |name| std::env::var(name).ok())
     }
 }
 

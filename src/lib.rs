@@ -49,7 +49,11 @@ pub mod history;
 #[cfg(feature = "service")]
 pub mod notify;
 #[cfg(feature = "service")]
+pub mod outgoing;
+#[cfg(feature = "service")]
 pub mod publish;
+#[cfg(feature = "service")]
+pub mod traces;
 
 pub mod mot;
 

@@ -35,6 +35,8 @@ mod secrets;
 mod server;
 #[path = "service/support.rs"]
 mod support;
+#[path = "service/traces.rs"]
+mod traces;
 #[path = "service/tracks.rs"]
 mod tracks;
 #[path = "service/truth.rs"]

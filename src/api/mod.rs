@@ -47,6 +47,7 @@ mod server;
 mod socket;
 mod ssrf;
 mod table;
+mod trace;
 mod tracks;
 mod video;
 
@@ -74,6 +75,7 @@ use crate::auth::Gate;
 use crate::history::Database;
 use crate::notify::WebhookHandle;
 use crate::publish::{EventHub, Hub};
+use crate::traces::Traces;
 use socket::{Seats, Sockets};
 use video::Studio;
 
@@ -104,6 +106,8 @@ pub struct ApiConfig {
     pub gate: Arc<Gate>,
     /// What an admin may change while it runs.
     pub operations: Option<Arc<dyn Operations>>,
+    /// Where traces of requests go.
+    pub traces: Option<Traces>,
     /// Certificate and key; without them it is plain HTTP.
     pub tls: Option<Arc<ServerConfig>>,
 }
@@ -128,8 +132,19 @@ struct ApiState {
 }
 
 fn router(config: ApiConfig, sockets: Sockets) -> Router {
-    let ApiConfig { cameras, hub, events, history, webhooks, registry, readiness, gate, operations, tls } =
-        config;
+    let ApiConfig {
+        cameras,
+        hub,
+        events,
+        history,
+        webhooks,
+        registry,
+        readiness,
+        gate,
+        operations,
+        traces,
+        tls,
+    } = config;
     let studio = Arc::new(Studio::default());
     let (seats, secure) = (Seats::default(), tls.is_some());
     let webhooks = webhooks.into();
@@ -148,7 +163,7 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
         seats,
         sockets,
     };
-    Router::new()
+    let routes = Router::new()
         .route("/v1/cameras", get(rest::list).post(rest::add))
         .route("/v1/cameras/{id}", get(rest::get).patch(rest::patch).delete(rest::remove))
         .route("/v1/cameras/{id}/snapshot.jpg", get(live::snapshot))
@@ -186,7 +201,13 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
         .route("/v1/session", get(auth::session).post(auth::sign_in).delete(auth::sign_out))
         .merge(page::routes())
         .route_layer(from_fn(etag::tag))
-        .route_layer(from_fn_with_state(state.clone(), auth::guard))
+        .route_layer(from_fn_with_state(state.clone(), auth::guard));
+    let routes = match traces {
+        // Around all the rest: who is refused is traced, too.
+        Some(traces) => routes.route_layer(from_fn_with_state(traces, trace::request)),
+        None => routes,
+    };
+    routes
         .fallback(rest::no_such_path)
         .method_not_allowed_fallback(rest::no_such_method)
         .layer(DefaultBodyLimit::max(MAX_BODY_BYTES))

@@ -22,6 +22,7 @@ use crate::notify::{Notifier, NotifyPlan};
 use crate::pipeline::{CameraSet, Lanes, MAX_CAMERAS, SetConfig, Store, source_spec};
 use crate::publish::{EventHub, Hub, HubConfig};
 use crate::telemetry::Metrics;
+use crate::traces::{Exporter, TracesPlan};
 use crate::track::TrackerConfig;
 use crate::types::CameraId;
 
@@ -111,6 +112,7 @@ pub(super) struct Plan {
     pub(super) tracker: TrackerOptions,
     pub(super) models: crate::infer::ModelSettings,
     notify: NotifyPlan,
+    traces: Option<TracesPlan>,
 }
 
 impl Args {
@@ -131,6 +133,7 @@ impl Plan {
     pub(super) fn new(args: Args) -> Result<Self> {
         let (given, mut config) = (args.clone(), args.configuration()?);
         let notify = config.take_notify()?;
+        let traces = config.take_traces()?;
         let tracker = config.tracker.tuned(args.tuning)?;
         let mut cameras = config.cameras;
         for text in &args.cameras {
@@ -191,6 +194,7 @@ impl Plan {
             tracker,
             models: crate::config::ModelConfig::from(args.models).or(config.models).settings()?,
             notify,
+            traces,
         })
     }
 }
@@ -199,7 +203,7 @@ async fn serve(plan: Plan) -> Result<()> {
     let mut signals = Signals::listen()?;
     let (stop, stopped) = oneshot::channel();
     let mut service = std::pin::pin!(async {
-        let Service { listener, config, set, history, notifier } = start(plan).await?;
+        let Service { listener, config, set, history, notifier, exporter } = start(plan).await?;
         let hub = config.hub.clone();
         let served = api::serve(listener, config, async {
             // An error means that nobody can ask for the end any more: that is the end too.
@@ -211,6 +215,10 @@ async fn serve(plan: Plan) -> Result<()> {
         set.shutdown().await;
         if let Some(history) = history {
             history.stop().await;
+        }
+        // Last: what ends before it has its say.
+        if let Some(exporter) = exporter {
+            exporter.stop().await;
         }
         served.context("the HTTP server failed")
     });
@@ -237,6 +245,7 @@ struct Service {
     set: Arc<CameraSet>,
     history: Option<History>,
     notifier: Notifier,
+    exporter: Option<Exporter>,
 }
 
 /// Loads the models, takes the port, starts the cameras: in this order, so that a mistake leaves
@@ -252,7 +261,9 @@ async fn start(plan: Plan) -> Result<Service> {
     let hub = Hub::new(HubConfig::default(), models.detector.classes().into());
     hub.metrics().register(metrics.registry())?;
     let events = EventHub::new(hub.classes().clone());
-    let lanes = Lanes::start(models, metrics.clone())?;
+    let exporter = plan.traces.map(|plan| Exporter::start(plan, metrics.registry())).transpose()?;
+    let (exporter, traces) = exporter.unzip();
+    let lanes = Lanes::start(models, metrics.clone())?.traced(traces.clone());
     let listener = TcpListener::bind(plan.listen)
         .await
         .with_context(|| format!("cannot listen on {}: choose another address with --listen", plan.listen))?;
@@ -299,9 +310,10 @@ async fn start(plan: Plan) -> Result<Service> {
         readiness: Arc::new(Vec::new),
         gate: Arc::new(plan.gate),
         operations: Some(reloader),
+        traces,
         tls,
     };
-    Ok(Service { listener, config, set, history, notifier })
+    Ok(Service { listener, config, set, history, notifier, exporter })
 }
 
 /// The newest picture of each camera.

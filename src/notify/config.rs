@@ -6,55 +6,18 @@ use std::time::Duration;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use serde::{Deserialize, Deserializer};
+use serde::Deserialize;
 use tokio_rustls::TlsConnector;
 
-use super::endpoint::{Address, Login, Scheme, trust};
+use crate::outgoing::{Address, HTTP, Login, Scheme, Secret, trust};
 use crate::publish::{EVENT_KINDS, EventFilter};
 use crate::types::{CameraId, is_name};
 
-const HTTP: [Scheme; 2] =
-    [Scheme { name: "http", tls: false, port: 80 }, Scheme { name: "https", tls: true, port: 443 }];
 const MQTT: [Scheme; 2] =
     [Scheme { name: "mqtt", tls: false, port: 1883 }, Scheme { name: "mqtts", tls: true, port: 8883 }];
 
 /// What stands before the base64 of a webhook's secret.
 const SECRET_PREFIX: &str = "whsec_";
-
-/// A text that may be secret: neither `Debug` nor an error about its type shows it.
-#[derive(Clone, PartialEq, Eq)]
-pub struct Secret(String);
-
-impl Secret {
-    fn text(&self) -> &str {
-        &self.0
-    }
-}
-
-impl fmt::Debug for Secret {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("***")
-    }
-}
-
-impl From<&str> for Secret {
-    fn from(text: &str) -> Self {
-        Self(text.to_owned())
-    }
-}
-
-impl<'de> Deserialize<'de> for Secret {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        // Serde's own error would quote the number that somebody's password is.
-        match toml::Value::deserialize(deserializer)? {
-            toml::Value::String(text) => Ok(Self(text)),
-            other => Err(serde::de::Error::custom(format_args!(
-                "must be a text in quotes, not of type {}",
-                other.type_str()
-            ))),
-        }
-    }
-}
 
 /// `[[webhook]]`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]

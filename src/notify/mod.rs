@@ -11,14 +11,11 @@
 
 mod cloud_event;
 mod config;
-mod endpoint;
 mod home_assistant;
 mod mqtt;
 mod onvif;
-mod post;
 mod queue;
 mod retained;
-mod sparing;
 mod webhook;
 
 use std::sync::Arc;
@@ -28,7 +25,7 @@ use prometheus::Registry;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-pub use config::{MqttOptions, MqttPlan, NotifyError, Secret, WebhookOptions, WebhookPlan};
+pub use config::{MqttOptions, MqttPlan, NotifyError, WebhookOptions, WebhookPlan};
 pub use webhook::{WebhookHandle, WebhookStatus};
 
 use crate::api::Cameras;

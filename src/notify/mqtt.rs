@@ -24,9 +24,9 @@ use super::config::MqttPlan;
 use super::home_assistant::Discovery;
 use super::onvif;
 use super::retained::{Ledger, Snapshots, Topics};
-use super::sparing::{Sparing, backoff};
 use super::{GRACE, Stop};
 use crate::api::Cameras;
+use crate::outgoing::{Sparing, backoff};
 use crate::publish::{
     self, EventFilter, EventHub, EventListener, Heard, Hub, NumberedEvent, Report, Subscription,
 };

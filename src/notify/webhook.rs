@@ -14,10 +14,9 @@ use tokio::time::{sleep, sleep_until, timeout};
 
 use super::cloud_event::{MEDIA_TYPE, body, signature};
 use super::config::WebhookPlan;
-use super::post::Poster;
 use super::queue::{Queue, Waiting};
-use super::sparing::{Sparing, backoff};
 use super::{GRACE, Stop};
+use crate::outgoing::{Poster, Sparing, backoff};
 use crate::publish::{EventHub, EventListener, Heard};
 
 /// Longest wait between two attempts that the receiver did not ask for.

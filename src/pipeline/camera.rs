@@ -14,6 +14,7 @@ use super::{Mailbox, Policy, Ticket, embed, link};
 use crate::infer::Models;
 use crate::ingest::{self, Failure, Opened, RawFrame, SourceError, SourceEvent, SourceHandle, SourceSpec};
 use crate::telemetry::{CameraMetrics, DropReason, Metrics};
+use crate::traces::{Step, Traces};
 use crate::track::TrackerConfig;
 use crate::types::{CameraId, Epoch, Frame};
 
@@ -32,6 +33,7 @@ pub struct Lanes {
     metrics: Arc<Metrics>,
     tracker: TrackerThread,
     link: Option<JoinHandle<()>>,
+    traces: Option<Traces>,
 }
 
 impl Lanes {
@@ -43,7 +45,12 @@ impl Lanes {
         // Without a scorer (an association that asks none) there is nobody to send jobs to, and none are.
         let stage = |linker| tokio::spawn(link::run(job_queue, linker, answers.downgrade()));
         let link = models.linker.clone().map(stage);
-        Ok(Self { models, metrics, tracker, link })
+        Ok(Self { models, metrics, tracker, link, traces: None })
+    }
+
+    /// With traces of the cameras' frames.
+    pub fn traced(self, traces: Option<Traces>) -> Self {
+        Self { traces, ..self }
     }
 
     /// The models.
@@ -221,6 +228,7 @@ impl Camera {
             view: view.clone(),
             mailbox: mailbox.clone(),
             all: lanes.metrics.clone(),
+            traces: lanes.traces.clone(),
             index: 0,
             last_decoded: None,
             opened_before: false,
@@ -269,6 +277,7 @@ struct Sink {
     view: Arc<CameraView>,
     mailbox: Arc<Mailbox<Captured>>,
     all: Arc<Metrics>,
+    traces: Option<Traces>,
     index: u64,
     last_decoded: Option<Instant>,
     opened_before: bool,
@@ -300,11 +309,11 @@ impl Sink {
             }
             SourceEvent::Frame(raw) => return self.frame(raw),
             SourceEvent::Corrupt => {
-                Ticket::new(self.view.metrics.clone()).dropped(DropReason::Corrupt);
+                self.ticket(None, Instant::now()).dropped(DropReason::Corrupt);
             }
             SourceEvent::Skipped { frames } => {
                 for _ in 0..frames {
-                    Ticket::new(self.view.metrics.clone()).dropped(DropReason::Undecoded);
+                    self.ticket(None, Instant::now()).dropped(DropReason::Undecoded);
                 }
             }
             SourceEvent::Lost { reason, retry_in } => {
@@ -331,6 +340,13 @@ impl Sink {
         ControlFlow::Continue(())
     }
 
+    /// Counts a frame in.
+    fn ticket(&self, index: Option<u64>, began: Instant) -> Ticket {
+        let CameraView { id, epoch, metrics, .. } = &*self.view;
+        let trace = self.traces.as_ref().and_then(|traces| traces.frame(id, *epoch, index, began));
+        Ticket::new(metrics.clone(), trace)
+    }
+
     fn frame(&mut self, raw: RawFrame) -> ControlFlow<()> {
         let RawFrame { image, time, capture, decoded } = raw;
         let size = (image.width, image.height);
@@ -348,12 +364,13 @@ impl Sink {
             decoded,
             image,
         };
+        let ticket = self.ticket(Some(self.index), decoded);
         self.index += 1;
-        let ticket = Ticket::new(self.view.metrics.clone());
         match self.mailbox.put(Captured { frame: Arc::new(frame), ticket }) {
             Ok(None) => ControlFlow::Continue(()),
-            Ok(Some(displaced)) => {
-                displaced.ticket.dropped(DropReason::Overload);
+            Ok(Some(Captured { frame, mut ticket })) => {
+                ticket.step(Step::Wait, frame.decoded);
+                ticket.dropped(DropReason::Overload);
                 ControlFlow::Continue(())
             }
             // Closed: the ticket settles itself as stopped.

@@ -9,6 +9,7 @@ use tokio::sync::mpsc;
 use super::{Mailbox, Ticket};
 use crate::detect::Detector;
 use crate::telemetry::{DropReason, Metrics, Stage};
+use crate::traces::Step;
 use crate::types::{Detection, Frame};
 
 /// A frame from the source.
@@ -44,12 +45,14 @@ pub async fn run(
     });
     let mut detected = std::pin::pin!(
         frames
-            .map(|Captured { frame, ticket }| {
+            .map(|Captured { frame, mut ticket }| {
                 let detector = detector.clone();
                 wait.observe(frame.decoded.elapsed().as_secs_f64());
+                ticket.step(Step::Wait, frame.decoded);
                 async move {
                     let start = Instant::now();
                     let answer = detector.detect(frame.image.clone()).await;
+                    ticket.step(Step::Detect, start);
                     (frame, ticket, answer, start.elapsed())
                 }
             })

@@ -11,6 +11,7 @@ use super::detect::Detected;
 use super::tracker::Seat;
 use crate::embed::Embedder;
 use crate::telemetry::{DropReason, Metrics, Stage};
+use crate::traces::Step;
 use crate::types::{Detection, Embedding, Frame};
 
 /// A frame with everything that the tracker needs.
@@ -47,7 +48,7 @@ pub async fn run(
     });
     let mut embedded = std::pin::pin!(
         arriving
-            .map(|Detected { frame, ticket, detections }| {
+            .map(|Detected { frame, mut ticket, detections }| {
                 let embedder = embedder.clone();
                 async move {
                     let start = Instant::now();
@@ -58,6 +59,7 @@ pub async fn run(
                         }
                         _ => Ok(Vec::new()),
                     };
+                    ticket.step(Step::Embed, start);
                     (frame, ticket, detections, answer, start.elapsed())
                 }
             })

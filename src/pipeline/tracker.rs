@@ -16,6 +16,7 @@ use super::outlet::Outlet;
 use crate::egomotion::Egomotion;
 use crate::infer::InferError;
 use crate::telemetry::{CameraMetrics, DropReason, Metrics, Stage};
+use crate::traces::Step;
 use crate::track::shift::Shift;
 use crate::track::{FrameInput, LinkRequest, Tracker, TrackerConfig, Update};
 use crate::types::{CameraId, Clock, Epoch, FrameTracks, TrackState};
@@ -207,7 +208,7 @@ impl Worker {
     fn advance(&mut self, slot: Slot) {
         let Some(desk) = self.seats.get_mut(&slot) else { return };
         while desk.in_hand.is_none() {
-            let Some(frame) = desk.backlog.pop_front() else {
+            let Some(mut frame) = desk.backlog.pop_front() else {
                 if let Some(done) = desk.leaving.take() {
                     self.seats.remove(&slot);
                     // Whoever asked may have stopped waiting.
@@ -221,6 +222,7 @@ impl Worker {
             let shift = desk.egomotion.as_mut().and_then(|e| e.next(&frame.frame.image));
             desk.tracker.predict(input(&frame, shift), &mut request);
             let predicted_in = start.elapsed();
+            frame.ticket.step(Step::Predict, start);
             let asked = Instant::now();
             let empty = request.is_empty();
             desk.in_hand = Some(InHand { frame, predicted_in, asked });
@@ -239,13 +241,15 @@ impl Worker {
         let Some(desk) = self.seats.get_mut(&slot) else { return };
         match links {
             Ok(links) => {
-                if let Some(in_hand) = &desk.in_hand {
-                    self.link.observe(in_hand.asked.elapsed().as_secs_f64());
+                if let Some(InHand { frame, asked, .. }) = &mut desk.in_hand {
+                    self.link.observe(asked.elapsed().as_secs_f64());
+                    frame.ticket.step(Step::Link, *asked);
                 }
                 desk.finish(&links, &self.track);
             }
             Err(error) => {
-                if let Some(in_hand) = desk.in_hand.take() {
+                if let Some(mut in_hand) = desk.in_hand.take() {
+                    in_hand.frame.ticket.step(Step::Link, in_hand.asked);
                     let frame = in_hand.frame.frame.index;
                     tracing::warn!(camera = %desk.camera, frame, %error, "link scores failed");
                     in_hand.frame.ticket.dropped(DropReason::Inference);
@@ -274,7 +278,9 @@ impl Desk {
             let count = tracks.iter().filter(|t| t.state == state).count();
             self.metrics.tracks[state as usize].set(count as i64);
         }
-        let Embedded { frame, ticket, permit, .. } = frame;
+        let Embedded { frame, mut ticket, permit, .. } = frame;
+        ticket.step(Step::Update, start);
+        let updated = Instant::now();
         let report = FrameTracks {
             camera: self.camera.clone(),
             epoch: self.epoch,
@@ -296,6 +302,7 @@ impl Desk {
             self.metrics.capture_latency.observe(age as f64 * 1e-9);
         }
         self.outlet.emit(frame, Arc::new(report));
+        ticket.step(Step::Publish, updated);
         ticket.tracked();
         drop(permit);
     }

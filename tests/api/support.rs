@@ -253,6 +253,7 @@ impl Server {
             }),
             gate: Arc::new(gate),
             operations: None,
+            traces: None,
             tls,
         };
         let (stop, stopped) = oneshot::channel();

@@ -306,8 +306,8 @@ impl Service {
         self.request_with(&format!("Authorization: Bearer {token}\r\n"), method, path, json)
     }
 
-    /// HTTP/1.0: the answer ends with the connection and has no chunks.
-    fn request_with(&self, headers: &str, method: &str, path: &str, json: Option<&str>) -> Response {
+    /// With more header lines, each with its line break. HTTP/1.0: the answer ends with the connection and has no chunks.
+    pub fn request_with(&self, headers: &str, method: &str, path: &str, json: Option<&str>) -> Response {
         let mut stream = connect(self.address);
         let mut head = format!("{method} {path} HTTP/1.0\r\nHost: {}\r\n{headers}", self.address);
         if let Some(json) = json {

@@ -6,7 +6,7 @@ const EVERY: Duration = Duration::from_secs(30);
 
 /// Counts losses and says when it is time to tell of them.
 #[derive(Debug, Default)]
-pub(super) struct Sparing {
+pub(crate) struct Sparing {
     told: Option<Instant>,
     since: u64,
 }
@@ -25,7 +25,7 @@ impl Sparing {
 
 /// How long to wait after so many failures in a row: doubled each time from half a second on, at most `most`, and
 /// between half and all of that, so that many clients do not come back in step.
-pub(super) fn backoff(failures: u32, most: Duration) -> Duration {
+pub(crate) fn backoff(failures: u32, most: Duration) -> Duration {
     let base = Duration::from_millis(500).saturating_mul(1 << failures.saturating_sub(1).min(16));
     base.min(most).mul_f64(0.5 + 0.5 * fastrand::f64())
 }

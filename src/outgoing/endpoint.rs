@@ -1,4 +1,4 @@
-//! Where a webhook or a broker is, and the way there. What may be secret in its URL is never shown.
+//! Where a receiver is: a webhook, a broker, a collector, and the way there. What may be secret in its URL is never shown.
 
 use std::fmt;
 use std::io;
@@ -16,22 +16,26 @@ use tokio_rustls::rustls::{self, ClientConfig, RootCertStore};
 
 /// A scheme that an address may have.
 #[derive(Clone, Copy, PartialEq)]
-pub(super) struct Scheme {
+pub(crate) struct Scheme {
     pub name: &'static str,
     pub tls: bool,
     pub port: u16,
 }
 
+/// Those of posts.
+pub(crate) const HTTP: [Scheme; 2] =
+    [Scheme { name: "http", tls: false, port: 80 }, Scheme { name: "https", tls: true, port: 443 }];
+
 /// User and password, percent-decoded.
 #[derive(Clone, PartialEq)]
-pub(super) struct Login {
+pub(crate) struct Login {
     pub user: String,
     pub password: String,
 }
 
 /// A URL taken apart. `Display` and `Debug` show scheme, host and port: a path or a query may be a token.
 #[derive(Clone, PartialEq)]
-pub(super) struct Address {
+pub(crate) struct Address {
     scheme: Scheme,
     pub tls: bool,
     pub host: String,
@@ -107,12 +111,12 @@ impl fmt::Debug for Address {
 }
 
 /// A connection, encrypted or not.
-pub(super) trait Stream: AsyncRead + AsyncWrite + Unpin + Send + Sync {}
+pub(crate) trait Stream: AsyncRead + AsyncWrite + Unpin + Send + Sync {}
 
 impl<T: AsyncRead + AsyncWrite + Unpin + Send + Sync> Stream for T {}
 
 /// The client's side of TLS: who is trusted is in `ca_file`, or what the system trusts. The error says what to do.
-pub(super) fn trust(ca_file: Option<&Path>) -> Result<TlsConnector, String> {
+pub(crate) fn trust(ca_file: Option<&Path>) -> Result<TlsConnector, String> {
     let mut roots = RootCertStore::empty();
     match ca_file {
         Some(file) => {
@@ -145,9 +149,6 @@ pub(super) fn trust(ca_file: Option<&Path>) -> Result<TlsConnector, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    const HTTP: [Scheme; 2] =
-        [Scheme { name: "http", tls: false, port: 80 }, Scheme { name: "https", tls: true, port: 443 }];
 
     #[test]
     fn an_address_shows_no_secret() {

@@ -21,16 +21,18 @@ use super::endpoint::Address;
 const MAX_ANSWER: usize = 16 * 1024;
 
 /// What was answered.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Answer {
+#[derive(Clone, Debug)]
+pub(crate) struct Answer {
     pub status: StatusCode,
     /// How long the receiver wants to be left alone.
     pub retry_after: Option<Duration>,
+    /// What it says; empty where it is too long to be read.
+    pub body: Bytes,
 }
 
 /// Why there was no answer. The texts hold nothing of the URL.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum PostError {
+pub(crate) enum PostError {
     #[error("cannot connect: {0}")]
     Connect(io::Error),
     #[error("the connection broke: {0}")]
@@ -40,7 +42,7 @@ pub(super) enum PostError {
 }
 
 /// Posts to one address.
-pub(super) struct Poster {
+pub(crate) struct Poster {
     address: Address,
     tls: Option<TlsConnector>,
     connection: Option<Connection>,
@@ -82,7 +84,7 @@ impl Poster {
         let driver = tokio::spawn(async move {
             // Told to whoever waits for the answer, too.
             if let Err(error) = connection.await {
-                tracing::debug!(%error, "a webhook's connection ended");
+                tracing::debug!(%error, "a connection ended");
             }
         });
         Ok(Connection { sender, driver: driver.abort_handle() })
@@ -107,15 +109,17 @@ impl Poster {
         request.headers_mut().extend(headers.clone());
         connection.sender.ready().await?;
         let response = connection.sender.send_request(request).await?;
-        let answer = Answer {
-            status: response.status(),
-            retry_after: response.headers().get(header::RETRY_AFTER).and_then(retry_after),
-        };
+        let status = response.status();
+        let retry_after = response.headers().get(header::RETRY_AFTER).and_then(retry_after);
         // An answer that is longer, or breaks off, costs the connection and nothing else.
-        if to_bytes(Body::new(response.into_body()), MAX_ANSWER).await.is_ok() {
-            self.connection = Some(connection);
-        }
-        Ok(answer)
+        let body = match to_bytes(Body::new(response.into_body()), MAX_ANSWER).await {
+            Ok(body) => {
+                self.connection = Some(connection);
+                body
+            }
+            Err(_) => Bytes::new(),
+        };
+        Ok(Answer { status, retry_after, body })
     }
 }
 
