@@ -1,5 +1,6 @@
 import { useSignal } from "@preact/signals";
 import { words } from "../api";
+import { FormEnd } from "../ui/FormEnd";
 import { leastPoints, remove, save, type Draft } from "./rules";
 
 /** What is being drawn, beside the picture: what to do next, its name and settings, save or not. */
@@ -138,16 +139,7 @@ export function RuleForm(props: {
         </label>
       )}
       {draft.was && what !== "mask" && <p class="quiet">What is changed counts from zero again.</p>}
-      <p role="alert" class="bad">
-        {error}
-      </p>
-      <div class="row">
-        <button type="submit" class="main" disabled={busy.value}>
-          Save
-        </button>
-        <button type="button" onClick={done}>
-          Cancel
-        </button>
+      <FormEnd error={error.value} busy={busy.value} send="Save" cancel={done}>
         {draft.was && (
           <button
             type="button"
@@ -158,7 +150,7 @@ export function RuleForm(props: {
             Delete
           </button>
         )}
-      </div>
+      </FormEnd>
     </form>
   );
 }

@@ -6,6 +6,7 @@ import { LiveView } from "../live/LiveView";
 import { cameraHref, go } from "../route";
 import { refresh } from "../state";
 import { Dialog } from "../ui/Dialog";
+import { FormEnd } from "../ui/FormEnd";
 import { CameraFields, type Fields } from "./CameraForm";
 
 const LOOK_MS = 400;
@@ -75,17 +76,7 @@ export function AddCamera({ close }: { close: () => void }) {
           }}
         >
           <CameraFields fields={fields} />
-          <p role="alert" class="bad">
-            {error.value}
-          </p>
-          <div class="row">
-            <button type="submit" class="main" disabled={busy.value}>
-              Connect
-            </button>
-            <button type="button" onClick={close}>
-              Cancel
-            </button>
-          </div>
+          <FormEnd error={error.value} busy={busy.value} send="Connect" cancel={close} />
         </form>
       </Dialog>
     );

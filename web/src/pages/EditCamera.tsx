@@ -2,6 +2,7 @@ import { useSignal } from "@preact/signals";
 import { ask, cameraPath, words, type Camera } from "../api";
 import { refresh } from "../state";
 import { Dialog } from "../ui/Dialog";
+import { FormEnd } from "../ui/FormEnd";
 import { CameraFields, type Fields } from "./CameraForm";
 
 /** Changes where a camera is. The password of its address is not shown, so an empty field leaves it as it is. */
@@ -37,18 +38,8 @@ export function EditCamera({ camera, close }: { camera: Camera; close: () => voi
         }}
       >
         <CameraFields fields={fields} current={camera.url} />
-        <p class="quiet">The connection is made anew. Lines, zones and their counts stay; people in view get new numbers.</p>
-        <p role="alert" class="bad">
-          {error.value}
-        </p>
-        <div class="row">
-          <button type="submit" class="main" disabled={busy.value}>
-            Save
-          </button>
-          <button type="button" onClick={close}>
-            Cancel
-          </button>
-        </div>
+        <p class="quiet">The connection is made anew. Lines, zones, masks and counts stay; people in view get new numbers.</p>
+        <FormEnd error={error.value} busy={busy.value} send="Save" cancel={close} />
       </form>
     </Dialog>
   );
