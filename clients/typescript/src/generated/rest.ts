@@ -2491,7 +2491,7 @@ export interface operations {
             };
         };
         responses: {
-            /** @description Added; the next picture that anybody gets is masked. */
+            /** @description Added; pictures that are made from now on are masked. */
             201: {
                 headers: {
                     /** @description The path of what was added. */
