@@ -16,7 +16,9 @@ use gstreamer as gst;
 use gstreamer::glib;
 use gstreamer_app as gst_app;
 use gstreamer_rtsp_server as rtsp;
+use gstreamer_rtsp_server::gio;
 use gstreamer_rtsp_server::prelude::*;
+use socket2::SockRef;
 
 use feed::Feeds;
 use footage::Footage;
@@ -173,20 +175,19 @@ impl TestCamera {
 
         let context = glib::MainContext::new();
         let main_loop = glib::MainLoop::new(Some(&context), false);
-        let (ready, attached) = mpsc::sync_channel(1);
+        let (ready, listening) = mpsc::sync_channel(1);
         let (running, looping, serving) = (context.clone(), main_loop.clone(), server.clone());
         let thread = std::thread::Builder::new().name("test-camera".into()).spawn(move || {
-            let served = running.with_thread_default(|| {
-                let source = serving.attach(Some(&running));
-                let attached = source.is_ok();
-                // The other end waits for it.
-                let _ = ready.send(attached);
-                if attached {
+            let served = running.with_thread_default(|| match listen(&serving) {
+                Ok((source, port)) => {
+                    source.attach(Some(&running));
+                    // The other end waits for it.
+                    let _ = ready.send(Ok(port));
                     looping.run();
-                }
-                // SourceId::remove would look in the default context, and panic.
-                if let Some(source) = source.ok().and_then(|id| running.find_source_by_id(&id)) {
                     source.destroy();
+                }
+                Err(cause) => {
+                    let _ = ready.send(Err(cause));
                 }
             });
             if served.is_err() {
@@ -194,10 +195,8 @@ impl TestCamera {
             }
         });
         let thread = thread.map_err(taken)?;
-        if !attached.recv().unwrap_or(false) {
-            return Err(taken(std::io::Error::other("the RTSP server does not start")));
-        }
-        let port = u16::try_from(server.bound_port()).unwrap_or(config.listen.port());
+        let gone = |_| Err(std::io::Error::other("the RTSP server does not start"));
+        let port = listening.recv().unwrap_or_else(gone).map_err(taken)?;
         Ok(Self {
             address: (config.listen.ip(), port).into(),
             path: config.path,
@@ -288,6 +287,34 @@ impl Drop for TestCamera {
     fn drop(&mut self) {
         self.shut_down();
     }
+}
+
+/// Listens; what comes is the server's. Frames leave at once, as with a camera: where the kernel may wait for the
+/// acknowledgement of the last bytes (Nagle), one frame of a hundred is 40 ms late.
+fn listen(server: &rtsp::RTSPServer) -> std::io::Result<(glib::Source, u16)> {
+    let socket = server.create_socket(gio::Cancellable::NONE).map_err(std::io::Error::other)?;
+    // Connections have it from the socket that accepts them.
+    let tcp = SockRef::from(&socket);
+    tcp.set_tcp_nodelay(true)?;
+    let address = tcp.local_addr()?.as_socket();
+    let port = address.ok_or_else(|| std::io::Error::other("not a TCP socket"))?.port();
+    let server = server.clone();
+    let accept =
+        move |socket: &gio::Socket, condition| match rtsp::RTSPServer::io_func(socket, condition, &server) {
+            Ok(()) => glib::ControlFlow::Continue,
+            Err(_) => glib::ControlFlow::Break,
+        };
+    let ready =
+        glib::IOCondition::IN | glib::IOCondition::ERR | glib::IOCondition::HUP | glib::IOCondition::NVAL;
+    let source = SocketExtManual::create_source(
+        &socket,
+        ready,
+        gio::Cancellable::NONE,
+        None,
+        glib::Priority::DEFAULT,
+        accept,
+    );
+    Ok((source, port))
 }
 
 /// Makes a media for every client: an appsrc, fed from memory, and a payloader.
