@@ -8,22 +8,27 @@
 #[path = "../tests/service/support.rs"]
 mod support;
 
+use std::collections::BTreeMap;
+use std::io::{Cursor, ErrorKind};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use futures::StreamExt;
 use jiff::Timestamp;
 use support::{CameraProcess, Service};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpSocket, TcpStream};
-use tokio_tungstenite::tungstenite::client::IntoClientRequest;
-use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
-use tokio_tungstenite::{WebSocketStream, client_async_with_config};
+use tokio_tungstenite::tungstenite::handshake::client::generate_key;
+use tokio_tungstenite::tungstenite::protocol::frame::FrameHeader;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::{Data, OpCode};
 
 /// Subscribers of the second phase, and those of them that do not read.
 const MANY: (usize, usize) = (200, 20);
 /// How long a phase is measured, after a settling second.
 const PHASE: Duration = Duration::from_secs(15);
+
+/// A message: when its frame was captured, and how many seconds later it was in the client's hands.
+type Received = (Timestamp, f64);
 
 /// What a phase showed.
 struct Seen {
@@ -31,6 +36,8 @@ struct Seen {
     rate: f64,
     /// Latencies of all messages of all readers, s, sorted.
     latencies: Vec<f64>,
+    /// Median over frames from the first reader's message to the last's, s.
+    spread: f64,
     /// Readers' gaps.
     gaps: usize,
     /// Resident memory of the service at the end, MB.
@@ -49,41 +56,94 @@ fn percentile(sorted: &[f64], p: f64) -> f64 {
     1000.0 * sorted.get(at).copied().unwrap_or(f64::NAN)
 }
 
-async fn subscribe(address: SocketAddr, narrow: bool) -> WebSocketStream<TcpStream> {
-    let stream = if narrow {
-        let socket = TcpSocket::new_v4().expect("a socket");
+/// A subscriber: its connection, and what came after the handshake's end.
+async fn subscribe(address: SocketAddr, narrow: bool) -> (TcpStream, Vec<u8>) {
+    let socket = TcpSocket::new_v4().expect("a socket");
+    if narrow {
         socket.set_recv_buffer_size(4096).expect("a small buffer");
-        socket.connect(address).await
-    } else {
-        TcpStream::connect(address).await
-    };
-    let request = format!("ws://{address}/v1/tracks").into_client_request().expect("a request");
-    // By default 128 KiB are cleared before each read.
-    let config = WebSocketConfig::default().read_buffer_size(8192);
-    let stream = stream.expect("a connection");
-    client_async_with_config(request, stream, Some(config)).await.expect("the handshake").0
+    }
+    let mut stream = socket.connect(address).await.expect("a connection");
+    let key = generate_key();
+    let request = format!(
+        "GET /v1/tracks HTTP/1.1\r\nHost: {address}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+         Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {key}\r\n\r\n"
+    );
+    stream.write_all(request.as_bytes()).await.expect("a request");
+    let mut answer = vec![];
+    loop {
+        assert_ne!(stream.read_buf(&mut answer).await.expect("an answer"), 0, "hung up");
+        if let Some(at) = answer.windows(4).position(|bytes| bytes == b"\r\n\r\n") {
+            assert!(answer.starts_with(b"HTTP/1.1 101 "), "{}", String::from_utf8_lossy(&answer));
+            return (stream, answer.split_off(at + 4));
+        }
+    }
 }
 
-/// Latencies, and how many gaps were told, until `end`. Messages are looked into afterwards: 180 clients that parse
-/// on the service's cores would measure each other.
-async fn read(mut socket: WebSocketStream<TcpStream>, from: Instant, end: Instant) -> (Vec<f64>, usize) {
-    let mut messages = vec![];
-    while let Ok(Some(Ok(message))) = tokio::time::timeout_at(end.into(), socket.next()).await {
-        messages.push((Instant::now(), Timestamp::now(), message));
-    }
-    let (mut latencies, mut gaps) = (vec![], 0);
-    for (at, now, message) in messages {
-        let Ok(text) = message.to_text() else { continue };
+/// Messages, and how many gaps were told, until `end`. A client that lives on the service's cores takes from what it
+/// measures: it only notes when so many bytes had come, and looks at them afterwards.
+async fn read(
+    (stream, begun): (TcpStream, Vec<u8>),
+    from: Timestamp,
+    end: Instant,
+) -> (Vec<Received>, usize) {
+    let mut bytes = vec![0; 4 << 20];
+    let mut filled = begun.len();
+    bytes[..filled].copy_from_slice(&begun);
+    let mut arrivals = vec![(filled, Timestamp::now())];
+    let reading = async {
+        while stream.readable().await.is_ok() {
+            match stream.try_read(&mut bytes[filled..]) {
+                Ok(0) => return,
+                Ok(n) => {
+                    filled += n;
+                    arrivals.push((filled, Timestamp::now()));
+                }
+                Err(error) if error.kind() == ErrorKind::WouldBlock => {}
+                Err(error) => panic!("{error}"),
+            }
+        }
+    };
+    let _ = tokio::time::timeout_at(end.into(), reading).await;
+    assert!(filled < bytes.len(), "a phase has more to read than there is room");
+    messages(&bytes[..filled], &arrivals, from)
+}
+
+/// Takes the stream of WebSocket frames apart.
+fn messages(bytes: &[u8], arrivals: &[(usize, Timestamp)], from: Timestamp) -> (Vec<Received>, usize) {
+    let (mut received, mut gaps) = (vec![], 0);
+    let mut frames = Cursor::new(bytes);
+    while let Some((header, length)) = FrameHeader::parse(&mut frames).expect("a frame") {
+        let begin = frames.position() as usize;
+        let finish = begin + length as usize;
+        let Some(payload) = bytes.get(begin..finish) else { break };
+        frames.set_position(finish as u64);
+        if header.opcode != OpCode::Data(Data::Text) {
+            continue;
+        }
+        let text = std::str::from_utf8(payload).expect("text");
         let Some((_, rest)) = text.split_once("\"capture_ts\":\"") else {
             gaps += usize::from(text.contains("\"gap\""));
             continue;
         };
         let captured: Timestamp = rest.split('"').next().expect("a time").parse().expect("a time");
-        if at >= from {
-            latencies.push(now.duration_since(captured).as_secs_f64());
+        let whole = arrivals.partition_point(|(filled, _)| *filled < finish);
+        let now = arrivals[whole].1;
+        if now >= from {
+            received.push((captured, now.duration_since(captured).as_secs_f64()));
         }
     }
-    (latencies, gaps)
+    (received, gaps)
+}
+
+/// Median over frames from the first reader's message to the last's, s.
+fn spread(received: &[Received]) -> f64 {
+    let mut frames: BTreeMap<Timestamp, (f64, f64)> = BTreeMap::new();
+    for &(captured, latency) in received {
+        let (first, last) = frames.entry(captured).or_insert((latency, latency));
+        *first = first.min(latency);
+        *last = last.max(latency);
+    }
+    median(frames.values().map(|(first, last)| last - first).collect())
 }
 
 fn phase(service: &Service, runtime: &tokio::runtime::Runtime, readers: usize, deaf: usize) -> Seen {
@@ -93,26 +153,29 @@ fn phase(service: &Service, runtime: &tokio::runtime::Runtime, readers: usize, d
         for _ in 0..deaf {
             silent.push(subscribe(service.address, true).await);
         }
-        let from = Instant::now() + Duration::from_secs(1);
-        let end = from + PHASE;
+        let settled = Instant::now() + Duration::from_secs(1);
+        let from = Timestamp::now() + Duration::from_secs(1);
+        let end = settled + PHASE;
         let mut tasks = vec![];
         for _ in 0..readers {
             tasks.push(tokio::spawn(read(subscribe(service.address, false).await, from, end)));
         }
-        tokio::time::sleep_until(from.into()).await;
+        tokio::time::sleep_until(settled.into()).await;
         let (before, since) = (tracked(), Instant::now());
         tokio::time::sleep_until(end.into()).await;
         let rate = (tracked() - before) / since.elapsed().as_secs_f64();
         let resident = service.metrics().get("process_resident_memory_bytes") / 1e6;
-        let (mut latencies, mut gaps) = (vec![], 0);
+        let (mut received, mut gaps) = (vec![], 0);
         for task in tasks {
             let (more, missed) = task.await.expect("a reader");
-            latencies.extend(more);
+            received.extend(more);
             gaps += missed;
         }
+        let spread = spread(&received);
+        let mut latencies: Vec<f64> = received.into_iter().map(|(_, latency)| latency).collect();
         latencies.sort_by(f64::total_cmp);
         drop(silent);
-        Seen { rate, latencies, gaps, resident }
+        Seen { rate, latencies, spread, gaps, resident }
     })
 }
 
@@ -138,15 +201,16 @@ fn main() {
         .enable_all()
         .build()
         .expect("a runtime");
-    println!("round  subscribers  frames/s  p50 ms  p95 ms  p99 ms  gaps  resident MB");
+    println!("round  subscribers  frames/s  p50 ms  p95 ms  p99 ms  spread ms  gaps  resident MB");
     let mut rates = vec![];
     let (mut alone, mut among) = (vec![], vec![]);
     for round in 1..=rounds {
         let show = |name: &str, seen: &Seen| {
             let [p50, p95, p99] = [0.5, 0.95, 0.99].map(|p| seen.percentile(p));
-            let Seen { rate, gaps, resident, .. } = seen;
+            let Seen { rate, gaps, resident, spread, .. } = seen;
+            let spread = 1000.0 * spread;
             println!(
-                "{round:5}  {name:>11}  {rate:8.2}  {p50:6.1}  {p95:6.1}  {p99:6.1}  {gaps:4}  {resident:11.0}"
+                "{round:5}  {name:>11}  {rate:8.2}  {p50:6.1}  {p95:6.1}  {p99:6.1}  {spread:9.2}  {gaps:4}  {resident:11.0}"
             );
         };
         let one = phase(&service, &runtime, 1, 0);
