@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Sets up what the tests need and runs all of them: formatting, lints, tests of every feature, tests
+# Sets up what the tests need and runs all of them: formatting, lints, documentation, tests of every feature, tests
 # of the pure core alone, and the dependency policy where cargo-deny is installed.
 #
 #   deploy/test.sh
@@ -21,6 +21,7 @@ export CARGO_INCREMENTAL=0
 run npm --prefix web run check
 run cargo fmt --check
 run cargo clippy --locked --all-targets --features learn -- -D warnings
+run env RUSTDOCFLAGS="-D warnings" cargo doc --no-deps --locked --features learn
 run cargo test --locked --features learn
 # Last: it shares the dependencies that are built by now. Without GStreamer and ONNX Runtime it
 # would build just the same.

@@ -18,7 +18,7 @@ use crate::api::NewCamera;
 use crate::detect::DetectorSettings;
 use crate::history::{HistorySettings, Place};
 use crate::infer::ModelSettings;
-use crate::notify::{MqttOptions, NotifyError, NotifyPlan, WebhookOptions};
+use crate::notify::{MqttOptions, NotifyError, NotifyPlan, RememberedWebhooks, WebhookOptions};
 use crate::traces::{TracesError, TracesOptions, TracesPlan};
 use crate::track::TrackerConfig;
 
@@ -141,7 +141,8 @@ pub struct ModelConfig {
 }
 
 impl Config {
-    /// What differs from `other` besides cameras: none of it can change while the service runs.
+    /// What differs from `other` besides cameras and who is told what happens: none of it can change while the service
+    /// runs.
     pub fn differs(&self, other: &Config) -> Vec<String> {
         let Config {
             listen,
@@ -153,9 +154,9 @@ impl Config {
             history,
             models,
             tracker,
-            webhooks,
-            mqtt,
             traces,
+            webhooks: _,
+            mqtt: _,
             cameras: _,
             folder: _,
         } = self;
@@ -169,8 +170,6 @@ impl Config {
             ("history", *history == other.history),
             ("models", *models == other.models),
             ("tracker", *tracker == other.tracker),
-            ("webhook", *webhooks == other.webhooks),
-            ("mqtt", *mqtt == other.mqtt),
             ("traces", *traces == other.traces),
         ];
         settings.into_iter().filter(|(_, same)| !same).map(|(name, _)| name.to_owned()).collect()
@@ -222,6 +221,7 @@ impl Config {
     pub fn take_notify(&mut self) -> Result<NotifyPlan, NotifyError> {
         Ok(NotifyPlan {
             webhooks: WebhookOptions::check_all(std::mem::take(&mut self.webhooks), &self.folder)?,
+            remembered: RememberedWebhooks::default(),
             mqtt: self.mqtt.take().map(|mqtt| mqtt.check(&self.folder)).transpose()?,
         })
     }

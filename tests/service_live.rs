@@ -23,6 +23,8 @@ mod masks;
 mod page;
 #[path = "browser/playwright.rs"]
 mod playwright;
+#[path = "webhook/receiver.rs"]
+mod receiver;
 #[path = "service/reload.rs"]
 mod reload;
 #[path = "service/rest.rs"]
@@ -43,3 +45,5 @@ mod tracks;
 mod truth;
 #[path = "service/typescript.rs"]
 mod typescript;
+#[path = "service/webhooks.rs"]
+mod webhooks;

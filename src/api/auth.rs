@@ -21,7 +21,7 @@ const CHANGE: Right = Right::Role(Role::Operator);
 const ADMIN: Right = Right::Role(Role::Admin);
 
 /// What each route asks for. One that is not here asks for an admin. `HEAD` asks for what `GET` does.
-pub const RIGHTS: [(&str, &str, Right); 51] = [
+pub const RIGHTS: [(&str, &str, Right); 56] = [
     ("GET", "/v1/cameras", VIEW),
     ("POST", "/v1/cameras", CHANGE),
     ("GET", "/v1/cameras/{id}", VIEW),
@@ -61,7 +61,12 @@ pub const RIGHTS: [(&str, &str, Right); 51] = [
     ("GET", "/v1/history/events", VIEW),
     ("GET", "/v1/history/events.csv", VIEW),
     ("GET", "/v1/history/counts", VIEW),
-    ("GET", "/v1/webhooks", Right::Role(Role::Admin)),
+    ("GET", "/v1/webhooks", CHANGE),
+    ("POST", "/v1/webhooks", CHANGE),
+    ("GET", "/v1/webhooks/{name}", CHANGE),
+    ("PATCH", "/v1/webhooks/{name}", CHANGE),
+    ("DELETE", "/v1/webhooks/{name}", CHANGE),
+    ("POST", "/v1/webhooks/{name}/test", CHANGE),
     ("GET", "/v1/session", Right::Nobody),
     ("POST", "/v1/session", Right::Nobody),
     ("DELETE", "/v1/session", Right::Nobody),

@@ -16,7 +16,8 @@
 //! /gakp.v1.Tracks/Subscribe        the same over gRPC
 //! /v1/events[/live]                what happened at lines and in zones; a WebSocket of it
 //! /v1/history[/...]                tracks and events that were; counts over time; CSV, MOTChallenge
-//! /v1/webhooks                     how webhooks fare
+//! /v1/webhooks                     where events are posted, and how that fares
+//! /v1/webhooks/{name}/test         one post now
 //! /v1/openapi.json                all of this for programs
 //! /v1/log /v1/reload               what is logged; reading the configuration again
 //! /metrics /healthz /readyz
@@ -50,6 +51,7 @@ mod table;
 mod trace;
 mod tracks;
 mod video;
+mod webhooks;
 
 use std::sync::Arc;
 
@@ -73,7 +75,7 @@ pub use socket::KeepAlive;
 
 use crate::auth::Gate;
 use crate::history::Database;
-use crate::notify::WebhookHandle;
+use crate::notify::Webhooks;
 use crate::publish::{EventHub, Hub};
 use crate::traces::Traces;
 use socket::{Seats, Sockets};
@@ -97,7 +99,7 @@ pub struct ApiConfig {
     /// What was; without it no history is kept.
     pub history: Option<Database>,
     /// Where events are posted.
-    pub webhooks: Vec<WebhookHandle>,
+    pub webhooks: Webhooks,
     /// What `/metrics` shows.
     pub registry: Registry,
     /// What `/readyz` asks.
@@ -119,7 +121,7 @@ struct ApiState {
     hub: Hub,
     events: EventHub,
     history: Option<Database>,
-    webhooks: Arc<[WebhookHandle]>,
+    webhooks: Webhooks,
     registry: Registry,
     readiness: Readiness,
     gate: Arc<Gate>,
@@ -147,7 +149,6 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
     } = config;
     let studio = Arc::new(Studio::default());
     let (seats, secure) = (Seats::default(), tls.is_some());
-    let webhooks = webhooks.into();
     let state = ApiState {
         cameras,
         hub,
@@ -191,7 +192,9 @@ fn router(config: ApiConfig, sockets: Sockets) -> Router {
         .route("/v1/history/events", get(history::events))
         .route("/v1/history/events.csv", get(history::events_csv))
         .route("/v1/history/counts", get(history::counts))
-        .route("/v1/webhooks", get(rest::webhooks))
+        .route("/v1/webhooks", get(webhooks::list).post(webhooks::add))
+        .route("/v1/webhooks/{name}", get(webhooks::get).patch(webhooks::patch).delete(webhooks::remove))
+        .route("/v1/webhooks/{name}/test", post(webhooks::test))
         .route("/v1/openapi.json", get(openapi::document))
         .route("/v1/log", get(operations::log).put(operations::set_log))
         .route("/v1/reload", post(operations::reload))

@@ -34,6 +34,10 @@ pub trait Operations: Send + Sync {
 pub struct Reloaded {
     /// Cameras of the configuration that were started, changed or removed.
     pub cameras: Vec<String>,
+    /// Webhooks of the configuration that were started, changed or removed.
+    pub webhooks: Vec<String>,
+    /// Whether the MQTT broker is another, or is told otherwise.
+    pub mqtt: bool,
     /// Whether the certificate was read again.
     pub certificate: bool,
     /// Settings that differ from those in use and take a restart.

@@ -6,6 +6,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 
 use super::{CameraError, EditError};
+use crate::notify::WebhookError;
 use crate::types::CameraIdError;
 
 /// An error as the client sees it: `application/problem+json` with `type`, `title`, `status`, `detail`.
@@ -143,6 +144,28 @@ impl From<EditError> for Problem {
                 Self::new(StatusCode::CONFLICT, "rule-exists", "The name is taken", detail)
             }
             EditError::Unknown { .. } => Self::unknown_rule(detail),
+        }
+    }
+}
+
+impl From<WebhookError> for Problem {
+    fn from(error: WebhookError) -> Self {
+        let detail = error.to_string();
+        match error {
+            WebhookError::Exists(_) => {
+                Self::new(StatusCode::CONFLICT, "webhook-exists", "The name is taken", detail)
+            }
+            WebhookError::Unknown(_) => {
+                Self::new(StatusCode::NOT_FOUND, "unknown-webhook", "No such webhook", detail)
+            }
+            WebhookError::Configured(_) => {
+                Self::new(StatusCode::CONFLICT, "configured-webhook", "The configuration has it", detail)
+            }
+            WebhookError::LimitReached(_) => {
+                Self::new(StatusCode::CONFLICT, "webhook-limit", "Too many webhooks", detail)
+            }
+            WebhookError::Invalid { .. } => Self::bad_request(detail),
+            WebhookError::Io(_) => Self::internal(detail),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! `/v1/cameras`, `/v1/webhooks`, health, metrics.
+//! `/v1/cameras`, health, metrics.
 
 use axum::extract::{Query, State};
 use axum::http::{Method, StatusCode, Uri, header};
@@ -11,7 +11,6 @@ use super::extract::{JsonBody, Path, camera_id};
 use super::problem::Problem;
 use super::{ApiState, CameraPatch, CameraStatus, NewCamera, ssrf};
 use crate::auth::Identity;
-use crate::notify::{WebhookHandle, WebhookStatus};
 use crate::types::CameraId;
 
 /// Cameras in an answer at most: more than a service takes.
@@ -55,15 +54,6 @@ pub(super) async fn list(
     Ok(Json(CameraList { cameras, next }))
 }
 
-#[derive(Serialize)]
-pub(super) struct WebhookList {
-    webhooks: Vec<WebhookStatus>,
-}
-
-pub(super) async fn webhooks(State(state): State<ApiState>) -> Json<WebhookList> {
-    Json(WebhookList { webhooks: state.webhooks.iter().map(WebhookHandle::status).collect() })
-}
-
 pub(super) async fn get(
     State(state): State<ApiState>,
     Path(name): Path<String>,
@@ -77,7 +67,7 @@ pub(super) async fn add(
     Extension(identity): Extension<Option<Identity>>,
     JsonBody(request): JsonBody<NewCamera>,
 ) -> Result<Response, Problem> {
-    ssrf::check(identity.as_ref(), &request.url).await?;
+    ssrf::check_camera(identity.as_ref(), &request.url).await?;
     let location = format!("/v1/cameras/{}", request.id);
     Ok(created(location, state.cameras.add(request).await?))
 }
@@ -95,7 +85,7 @@ pub(super) async fn patch(
 ) -> Result<Json<CameraStatus>, Problem> {
     let id = camera_id(&name)?;
     if let Some(url) = &patch.url {
-        ssrf::check(identity.as_ref(), url).await?;
+        ssrf::check_camera(identity.as_ref(), url).await?;
     }
     match state.cameras.patch(&id, patch).await {
         Ok(status) => Ok(Json(status)),

@@ -18,7 +18,8 @@ use crate::ingest::{self, Opened, SourceEvent};
 use crate::pipeline::source_spec;
 
 /// Tries everything that `gakp serve` needs with the same settings, and reports: configuration, state folder, address,
-/// models, history, every camera. Nothing is changed, no camera is tracked.
+/// models, history, receivers of events and traces, every camera. Nothing is changed, nothing is posted, no camera is
+/// tracked.
 ///
 /// Ends with 0 if all is well, with 2 if anything failed. A service that runs already holds its address.
 #[derive(Clone, clap::Args)]
@@ -99,6 +100,7 @@ pub fn run(args: Args) -> Result<()> {
     )?;
     models(&mut findings, &plan)?;
     history(&mut findings, &plan)?;
+    receivers(&mut findings, &plan)?;
     cameras(&mut findings, &plan, Duration::try_from_secs_f64(args.patience)?)?;
     match findings.failed {
         0 => Ok(()),
@@ -175,6 +177,23 @@ fn history(findings: &mut Findings, plan: &Plan) -> Result<()> {
         answered.map(|()| format!("{} answers", database.name()))
     });
     findings.of("history", found)
+}
+
+/// Whoever is told what happens. They hear nothing of it but a connection.
+fn receivers(findings: &mut Findings, plan: &Plan) -> Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let found = runtime.block_on(async {
+        let mut found = plan.notify.knock().await;
+        if let Some(traces) = &plan.traces {
+            found.push(("traces".to_owned(), traces.place(), traces.knock().await));
+        }
+        found
+    });
+    for (part, place, knocked) in found {
+        let reached = format!("{place} is there");
+        findings.of(&part, knocked.map(|()| reached).map_err(|error| format!("{place}: {error}")))?;
+    }
+    Ok(())
 }
 
 /// All at a time: one that does not answer costs nobody else's patience.

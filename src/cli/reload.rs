@@ -12,6 +12,7 @@ use super::serve::{Args, Plan};
 use crate::api::{Cameras, NewCamera, Operations, Reloaded};
 use crate::auth::tls::Certificates;
 use crate::config::Config;
+use crate::notify::Notifier;
 use crate::pipeline::CameraSet;
 
 /// The service's settings and what they were made of.
@@ -19,6 +20,7 @@ pub struct Reloader {
     args: Args,
     set: Arc<CameraSet>,
     certificates: Option<Arc<Certificates>>,
+    notifier: Arc<Notifier>,
     /// What is in use: one change at a time.
     current: Mutex<Current>,
 }
@@ -40,9 +42,10 @@ impl Reloader {
         cameras: Vec<NewCamera>,
         set: Arc<CameraSet>,
         certificates: Option<Arc<Certificates>>,
+        notifier: Arc<Notifier>,
     ) -> Result<Self> {
         let config = args.configuration()?;
-        Ok(Self { args, set, certificates, current: Mutex::new(Current { config, cameras }) })
+        Ok(Self { args, set, certificates, notifier, current: Mutex::new(Current { config, cameras }) })
     }
 
     async fn again(&self) -> Result<Reloaded> {
@@ -82,6 +85,9 @@ impl Reloader {
             cameras.push(camera);
         }
         current.cameras = cameras;
+        let told = self.notifier.configure(plan.notify).await;
+        (done.webhooks, done.mqtt) = (told.webhooks, told.mqtt);
+        done.failed.extend(told.failed);
         Ok(done)
     }
 }
@@ -99,9 +105,11 @@ impl Operations for Reloader {
         async move {
             match self.again().await {
                 Ok(done) => {
-                    let Reloaded { cameras, certificate, restart, failed } = &done;
+                    let Reloaded { cameras, webhooks, mqtt, certificate, restart, failed } = &done;
                     tracing::info!(
                         ?cameras,
+                        ?webhooks,
+                        mqtt,
                         certificate,
                         ?restart,
                         ?failed,

@@ -18,7 +18,7 @@ use crate::auth::{Gate, TokenFile};
 use crate::config::{Config, TrackerOptions};
 use crate::history::{History, HistoryMetrics, HistorySettings, Pictures};
 use crate::infer::Models;
-use crate::notify::{Notifier, NotifyPlan};
+use crate::notify::{Notifier, NotifyPlan, RememberedWebhooks};
 use crate::pipeline::{CameraSet, Lanes, MAX_CAMERAS, SetConfig, Store, source_spec};
 use crate::publish::{EventHub, Hub, HubConfig};
 use crate::telemetry::Metrics;
@@ -111,8 +111,8 @@ pub(super) struct Plan {
     snapshots: bool,
     pub(super) tracker: TrackerOptions,
     pub(super) models: crate::infer::ModelSettings,
-    notify: NotifyPlan,
-    traces: Option<TracesPlan>,
+    pub(super) notify: NotifyPlan,
+    pub(super) traces: Option<TracesPlan>,
 }
 
 impl Args {
@@ -132,7 +132,7 @@ impl Plan {
     /// The first that is wrong.
     pub(super) fn new(args: Args) -> Result<Self> {
         let (given, mut config) = (args.clone(), args.configuration()?);
-        let notify = config.take_notify()?;
+        let mut notify = config.take_notify()?;
         let traces = config.take_traces()?;
         let tracker = config.tracker.tuned(args.tuning)?;
         let mut cameras = config.cameras;
@@ -162,6 +162,7 @@ impl Plan {
         let listen = args.listen.or(config.listen).unwrap_or(SocketAddr::from(([127, 0, 0, 1], 8080)));
         let local = listen.ip().is_loopback();
         let store = Store::open(&state_dir)?;
+        notify = notify.and(RememberedWebhooks::read(&state_dir)?)?;
         let mut kept = config.history;
         kept.database = args.history.or(kept.database);
         let mut gate = Gate::new(TokenFile::path(&state_dir), local)?;
@@ -244,7 +245,7 @@ struct Service {
     config: ApiConfig,
     set: Arc<CameraSet>,
     history: Option<History>,
-    notifier: Notifier,
+    notifier: Arc<Notifier>,
     exporter: Option<Exporter>,
 }
 
@@ -286,19 +287,21 @@ async fn start(plan: Plan) -> Result<Service> {
         }
         None => None,
     };
-    let reloader = Reloader::new(plan.args, plan.cameras.clone(), set.clone(), plan.certificates.clone())?;
-    let reloader = Arc::new(reloader);
-    let tls = plan.certificates.map(|certificates| certificates.server()).transpose()?;
+    let tls = plan.certificates.as_ref().map(|certificates| certificates.server()).transpose()?;
+    let configured = plan.cameras.clone();
     for camera in plan.cameras {
         let id = camera.id.clone();
         set.start_configured(camera).await.with_context(|| format!("camera {:?}", id.as_str()))?;
     }
     set.start_remembered().await;
-    tokio::spawn(signals::on_hangup(reloader.clone())?);
     let scheme = if tls.is_some() { "https" } else { "http" };
     tracing::info!("the page is at {scheme}://{address}/");
     let cameras: Arc<dyn api::Cameras> = set.clone();
-    let notifier = Notifier::start(plan.notify, &cameras, &hub, &events, metrics.registry())?;
+    let notifier = Notifier::start(plan.notify, &cameras, &hub, &events, metrics.registry()).await?;
+    let notifier = Arc::new(notifier);
+    let reloader = Reloader::new(plan.args, configured, set.clone(), plan.certificates, notifier.clone())?;
+    let reloader = Arc::new(reloader);
+    tokio::spawn(signals::on_hangup(reloader.clone())?);
     let config = ApiConfig {
         cameras,
         hub,

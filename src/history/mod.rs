@@ -6,7 +6,7 @@
 //! ```
 //!
 //! The tracker never waits for the disk: the collector is a subscriber like any other, and a database that is slow
-//! or away costs memory up to [`MAX_PENDING`] rows, then the oldest of them, counted. Live tracks are written every
+//! or away costs memory up to 200,000 rows, then the oldest of them, counted. Live tracks are written every
 //! second as well, so a crash loses at most the last second.
 
 mod album;

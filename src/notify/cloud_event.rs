@@ -50,6 +50,22 @@ pub(super) fn body(event: &NumberedEvent) -> serde_json::Result<Bytes> {
     serde_json::to_vec(&cloud_event).map(Bytes::from)
 }
 
+/// The body of a post that only tries whether a receiver takes posts.
+pub(super) fn trial(id: &str, webhook: &str, time: &str) -> serde_json::Result<Bytes> {
+    let data: &RawValue = serde_json::from_str(r#"{"type":"test"}"#)?;
+    let cloud_event = CloudEvent {
+        specversion: "1.0",
+        id,
+        source: format!("/webhooks/{webhook}"),
+        kind: "gakp.test".into(),
+        subject: None,
+        time,
+        datacontenttype: "application/json",
+        data,
+    };
+    serde_json::to_vec(&cloud_event).map(Bytes::from)
+}
+
 /// The value of `webhook-signature`.
 pub(super) fn signature(key: &ring::hmac::Key, id: &str, timestamp: i64, body: &[u8]) -> String {
     let mut context = ring::hmac::Context::with_key(key);

@@ -1,6 +1,7 @@
 //! `[[webhook]]` and `[mqtt]` of the configuration, and what they come to once checked.
 
 use std::fmt;
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -96,6 +97,16 @@ pub struct WebhookPlan {
     pub(super) give_up: Duration,
     pub(super) queue: usize,
     pub(super) tls: Option<TlsConnector>,
+    /// What `key` and `tls` were made of.
+    made_of: (Option<Secret>, Option<Vec<u8>>),
+}
+
+impl WebhookPlan {
+    /// Whether it comes to the same as another of its name.
+    pub(super) fn is_like(&self, other: &Self) -> bool {
+        (&self.address, &self.filter, &self.made_of) == (&other.address, &other.filter, &other.made_of)
+            && (self.timeout, self.give_up, self.queue) == (other.timeout, other.give_up, other.queue)
+    }
 }
 
 impl fmt::Debug for WebhookPlan {
@@ -116,6 +127,18 @@ pub struct MqttPlan {
     pub(super) onvif: bool,
     pub(super) tracks_every: Duration,
     pub(super) tls: Option<TlsConnector>,
+    /// What `tls` was made of.
+    trusted: Option<Vec<u8>>,
+}
+
+impl MqttPlan {
+    /// Whether it comes to the same as another.
+    pub(super) fn is_like(&self, other: &Self) -> bool {
+        (&self.address, &self.login, &self.topic, &self.discovery, &self.trusted)
+            == (&other.address, &other.login, &other.topic, &other.discovery, &other.trusted)
+            && (self.every, self.tracks_every) == (other.every, other.tracks_every)
+            && (self.tracks, self.onvif) == (other.tracks, other.onvif)
+    }
 }
 
 impl fmt::Debug for MqttPlan {
@@ -126,7 +149,7 @@ impl fmt::Debug for MqttPlan {
 
 /// The first line of a file that holds a secret.
 fn read_secret(key: &str, file: &Path) -> Result<String, String> {
-    let text = std::fs::read_to_string(file);
+    let text = fs::read_to_string(file);
     let text = text.map_err(|e| format!("cannot read {key} {}: {e}", file.display()))?;
     let line = text.lines().next().unwrap_or_default().trim().to_owned();
     if line.is_empty() { Err(format!("{key} {} is empty", file.display())) } else { Ok(line) }
@@ -196,9 +219,7 @@ impl WebhookOptions {
         for (index, options) in options.into_iter().enumerate() {
             let name = options.name.clone().unwrap_or_else(|| format!("webhook-{}", index + 1));
             let place = format!("webhook {name:?}");
-            let plan = if !is_name(&name) {
-                Err("its name is not usable: use 1 to 64 of A-Z a-z 0-9 . _ -".to_owned())
-            } else if plans.iter().any(|plan| plan.name == name) {
+            let plan = if plans.iter().any(|plan| plan.name == name) {
                 Err("another webhook has this name: names must differ".to_owned())
             } else {
                 options.check(name, folder)
@@ -208,7 +229,11 @@ impl WebhookOptions {
         Ok(plans)
     }
 
-    fn check(self, name: String, folder: &Path) -> Result<WebhookPlan, String> {
+    /// Checks it. The error says what is wrong and quotes no secret.
+    pub(super) fn check(self, name: String, folder: &Path) -> Result<WebhookPlan, String> {
+        if !is_name(&name) {
+            return Err("its name is not usable: use 1 to 64 of A-Z a-z 0-9 . _ -".into());
+        }
         let address = Address::parse(self.url.text(), &HTTP).map_err(|e| format!("its url {e}"))?;
         let file = self.secret_file.map(|file| folder.join(file));
         let secret = secret_of("secret", self.secret, file.as_deref())?;
@@ -230,6 +255,10 @@ impl WebhookOptions {
         let ca_file = self.ca_file.map(|file| folder.join(file));
         Ok(WebhookPlan {
             name,
+            made_of: (
+                secret.as_deref().map(Secret::from),
+                ca_file.as_deref().and_then(|file| fs::read(file).ok()),
+            ),
             tls: address.tls.then(|| trust(ca_file.as_deref())).transpose()?,
             address,
             key,
@@ -265,6 +294,7 @@ impl MqttOptions {
         let discovery = self.discovery.unwrap_or_else(|| "homeassistant".into());
         let ca_file = self.ca_file.map(|file| folder.join(file));
         Ok(MqttPlan {
+            trusted: ca_file.as_deref().and_then(|file| fs::read(file).ok()),
             tls: address.tls.then(|| trust(ca_file.as_deref())).transpose()?,
             address,
             login,

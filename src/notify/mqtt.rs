@@ -12,13 +12,14 @@ use bytes::Bytes;
 use futures::future::BoxFuture;
 use futures::stream::FuturesOrdered;
 use futures::{FutureExt, StreamExt};
+use prometheus::core::Collector;
 use prometheus::{IntCounterVec, IntGauge, Opts, Registry};
 use rumqttc::{
     AsyncClient, ConnectionError, Event, Incoming, LastWill, MqttOptions, Publish, PublishOptions, QoS,
 };
 use tokio::sync::mpsc;
 use tokio::task::AbortHandle;
-use tokio::time::{MissedTickBehavior, interval, timeout_at};
+use tokio::time::{MissedTickBehavior, interval, timeout, timeout_at};
 
 use super::config::MqttPlan;
 use super::home_assistant::Discovery;
@@ -26,7 +27,7 @@ use super::onvif;
 use super::retained::{Ledger, Snapshots, Topics};
 use super::{GRACE, Stop};
 use crate::api::Cameras;
-use crate::outgoing::{Sparing, backoff};
+use crate::outgoing::{KNOCK, Sparing, backoff};
 use crate::publish::{
     self, EventFilter, EventHub, EventListener, Heard, Hub, NumberedEvent, Report, Subscription,
 };
@@ -50,15 +51,16 @@ const LOOK_BACK: Duration = Duration::from_secs(5);
 
 const KINDS: [&str; 5] = ["event", "state", "discovery", "tracks", "onvif"];
 
-/// The sink's figures.
-struct Figures {
+/// The sink's figures. Clones are the same.
+#[derive(Clone)]
+pub(super) struct Figures {
     connected: IntGauge,
     waiting: IntGauge,
     messages: IntCounterVec,
 }
 
 impl Figures {
-    fn register(registry: &Registry) -> prometheus::Result<Self> {
+    pub(super) fn register(registry: &Registry) -> prometheus::Result<Self> {
         let gauge = |name: &str, help: &str| -> prometheus::Result<IntGauge> {
             let gauge = IntGauge::new(name, help)?;
             registry.register(Box::new(gauge.clone()))?;
@@ -80,6 +82,19 @@ impl Figures {
         Ok(figures)
     }
 
+    /// They are shown no more.
+    pub(super) fn unregister(&self, registry: &Registry) {
+        let collectors: [Box<dyn Collector>; 3] = [
+            Box::new(self.connected.clone()),
+            Box::new(self.waiting.clone()),
+            Box::new(self.messages.clone()),
+        ];
+        for collector in collectors {
+            // An error means that it is not there.
+            let _ = registry.unregister(collector);
+        }
+    }
+
     fn count(&self, kind: &str, outcome: &str, messages: u64) {
         self.messages.with_label_values(&[kind, outcome]).inc_by(messages);
     }
@@ -91,10 +106,9 @@ pub(super) fn sink(
     cameras: Arc<dyn Cameras>,
     hub: &Hub,
     events: &EventHub,
-    registry: &Registry,
+    figures: Figures,
     stop: Stop,
-) -> prometheus::Result<impl Future<Output = ()> + Send + use<>> {
-    let figures = Figures::register(registry)?;
+) -> impl Future<Output = ()> + Send + use<> {
     let frames = plan.tracks || plan.onvif;
     let subscription = frames.then(|| hub.subscribe(publish::Only::All));
     let listener = events.listen(EventFilter::default());
@@ -118,7 +132,7 @@ pub(super) fn sink(
         losses: Sparing::default(),
         troubles: Sparing::default(),
     };
-    Ok(sink.run(listener, subscription, stop))
+    sink.run(listener, subscription, stop)
 }
 
 struct Sink {
@@ -223,6 +237,28 @@ impl Session {
     fn publish(&self, topic: String, message: Bytes, options: PublishOptions) -> bool {
         self.client.try_publish(topic, message, options).is_ok()
     }
+}
+
+/// Whether the broker lets us in; nothing is published.
+///
+/// # Errors
+/// Why not, in words.
+pub(super) async fn knock(plan: &MqttPlan) -> Result<(), String> {
+    let mut session = Session::open(plan, &Topics::new(plan.topic.clone()))?;
+    let answer = async {
+        loop {
+            match session.turn().await {
+                Turn::Incoming(Incoming::ConnAck(_)) => return Ok(()),
+                Turn::Incoming(_) | Turn::Acknowledged => {}
+                Turn::Lost(reason) => return Err(reason),
+            }
+        }
+    };
+    let answered = timeout(KNOCK, answer).await;
+    // Without a farewell the broker would tell the last will.
+    let _ = session.client.try_disconnect();
+    while let Ok(Turn::Incoming(_) | Turn::Acknowledged) = timeout(GRACE, session.turn()).await {}
+    answered.unwrap_or_else(|_| Err(format!("no answer within {} s", KNOCK.as_secs())))
 }
 
 /// What the session has to say; nothing, for ever, while there is none.

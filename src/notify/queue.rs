@@ -18,13 +18,14 @@ pub(super) struct Waiting {
 /// The queue between what collects events and what delivers them.
 #[derive(Debug)]
 pub(super) struct Queue {
-    bound: usize,
     inner: Mutex<Inner>,
     ready: Notify,
 }
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Inner {
+    /// How many may wait besides the one being delivered.
+    bound: usize,
     waiting: VecDeque<Waiting>,
     /// Being delivered.
     current: Option<Waiting>,
@@ -34,18 +35,28 @@ struct Inner {
 
 impl Queue {
     pub fn new(bound: usize) -> Self {
-        Self { bound, inner: Mutex::default(), ready: Notify::new() }
+        let inner = Inner { bound, waiting: VecDeque::new(), current: None, closed: false };
+        Self { inner: Mutex::new(inner), ready: Notify::new() }
     }
 
     /// Adds an event; whether the oldest had to go for it.
     pub fn push(&self, event: Arc<NumberedEvent>) -> bool {
         let mut inner = self.lock();
-        let full = inner.waiting.len() >= self.bound;
+        let full = inner.waiting.len() >= inner.bound;
         let dropped = if full { inner.waiting.pop_front() } else { None };
         inner.waiting.push_back(Waiting { event, since: Instant::now() });
         drop(inner);
         self.ready.notify_one();
         dropped.is_some()
+    }
+
+    /// Another bound from now on; how many of the oldest had to go for it.
+    pub fn resize(&self, bound: usize) -> u64 {
+        let mut inner = self.lock();
+        inner.bound = bound;
+        let over = inner.waiting.len().saturating_sub(bound);
+        inner.waiting.drain(..over);
+        over as u64
     }
 
     /// The next event to deliver, which is [`Queue::done`] later; `None` when it is closed and empty.
@@ -137,9 +148,12 @@ pub(super) mod tests {
         assert_eq!(queue.next().await.unwrap().event.id, "1");
         assert!(!queue.push(event(2).into()) && !queue.push(event(3).into()) && queue.push(event(4).into()));
         assert_eq!((queue.next().await.unwrap().event.id.as_str(), queue.len()), ("1", 3));
+        assert_eq!((queue.resize(1), queue.len()), (1, 2));
+        assert_eq!(queue.resize(2), 0);
+        assert!(!queue.push(event(5).into()));
         queue.done();
         queue.close();
-        for id in ["3", "4"] {
+        for id in ["4", "5"] {
             assert_eq!(queue.next().await.unwrap().event.id, id);
             queue.done();
         }

@@ -4,15 +4,19 @@ use std::fmt;
 use std::io;
 use std::path::Path;
 use std::sync::Arc;
+use std::time::Duration;
 
 use axum::http::Uri;
 use percent_encoding::percent_decode_str;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
+use tokio::time::timeout;
 use tokio_rustls::TlsConnector;
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::pki_types::{CertificateDer, ServerName};
 use tokio_rustls::rustls::{self, ClientConfig, RootCertStore};
+
+use super::reach::Reach;
 
 /// A scheme that an address may have.
 #[derive(Clone, Copy, PartialEq)]
@@ -25,6 +29,9 @@ pub(crate) struct Scheme {
 /// Those of posts.
 pub(crate) const HTTP: [Scheme; 2] =
     [Scheme { name: "http", tls: false, port: 80 }, Scheme { name: "https", tls: true, port: 443 }];
+
+/// How long a receiver may take that is only tried.
+pub(crate) const KNOCK: Duration = Duration::from_secs(10);
 
 /// User and password, percent-decoded.
 #[derive(Clone, PartialEq)]
@@ -43,6 +50,8 @@ pub(crate) struct Address {
     pub login: Option<Login>,
     /// Path and query.
     pub path: String,
+    /// How far it may lead; asked at each connection, for a name may have another address then.
+    pub reach: Reach,
 }
 
 impl Address {
@@ -77,7 +86,7 @@ impl Address {
         }
         let path = uri.path_and_query().map_or("/", |path| path.as_str()).to_owned();
         let port = uri.port_u16().unwrap_or(scheme.port);
-        Ok(Self { scheme: *scheme, tls: scheme.tls, host, port, login, path })
+        Ok(Self { scheme: *scheme, tls: scheme.tls, host, port, login, path, reach: Reach::Anywhere })
     }
 
     /// `host:port`, or the host alone where the port is the scheme's own.
@@ -88,12 +97,25 @@ impl Address {
     /// Connects; over TLS where the scheme says so.
     pub async fn connect(&self, tls: Option<&TlsConnector>) -> io::Result<Box<dyn Stream>> {
         let host = self.host.trim_start_matches('[').trim_end_matches(']');
-        let stream = TcpStream::connect((host, self.port)).await?;
+        let addresses = self.reach.resolve(host, self.port).await?;
+        let stream = TcpStream::connect(addresses.as_slice()).await?;
         // Messages are small and wanted at once.
         let _ = stream.set_nodelay(true);
         let Some(tls) = tls.filter(|_| self.tls) else { return Ok(Box::new(stream)) };
         let name = ServerName::try_from(host.to_owned()).map_err(io::Error::other)?;
         Ok(Box::new(tls.connect(name, stream).await?))
+    }
+
+    /// Whether it can be reached, by TLS where the scheme says so; nothing is asked.
+    ///
+    /// # Errors
+    /// Why not, in words.
+    pub async fn knock(&self, tls: Option<&TlsConnector>) -> Result<(), String> {
+        match timeout(KNOCK, self.connect(tls)).await {
+            Ok(Ok(_)) => Ok(()),
+            Ok(Err(error)) => Err(error.to_string()),
+            Err(_) => Err(format!("no connection within {} s", KNOCK.as_secs())),
+        }
     }
 }
 

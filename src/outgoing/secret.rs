@@ -1,8 +1,8 @@
-//! Texts of the configuration that nothing shows.
+//! Texts that nothing shows.
 
 use std::fmt;
 
-use serde::{Deserialize, Deserializer};
+use serde::{Deserialize, Deserializer, Serializer};
 
 /// A text that may be secret: neither `Debug` nor an error about its type shows it.
 #[derive(Clone, PartialEq, Eq)]
@@ -12,6 +12,20 @@ impl Secret {
     /// The text itself.
     pub(crate) fn text(&self) -> &str {
         &self.0
+    }
+}
+
+/// Writes the text as it is, into files that only their owner may read; for `serialize_with`. There is no other way to
+/// write a secret.
+pub(crate) fn reveal<S: Serializer>(secret: &Secret, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(&secret.0)
+}
+
+/// [`reveal`] for what may be absent.
+pub(crate) fn reveal_some<S: Serializer>(secret: &Option<Secret>, serializer: S) -> Result<S::Ok, S::Error> {
+    match secret {
+        Some(secret) => serializer.serialize_some(&secret.0),
+        None => serializer.serialize_none(),
     }
 }
 

@@ -63,7 +63,8 @@ pub struct EventFilter {
 }
 
 impl EventFilter {
-    fn wants(&self, event: &NumberedEvent) -> bool {
+    /// Whether it is one of those.
+    pub fn wants(&self, event: &NumberedEvent) -> bool {
         (self.cameras.is_empty() || self.cameras.contains(&event.camera))
             && (self.kinds.is_empty() || self.kinds.contains(event.kind))
     }

@@ -49,6 +49,21 @@ pub struct TracesPlan {
     pub(super) tls: Option<TlsConnector>,
 }
 
+impl TracesPlan {
+    /// Whether the collector can be reached; nothing is exported.
+    ///
+    /// # Errors
+    /// Why not, in words.
+    pub async fn knock(&self) -> Result<(), String> {
+        self.address.knock(self.tls.as_ref()).await
+    }
+
+    /// Where the collector is: scheme, host and port.
+    pub fn place(&self) -> String {
+        self.address.to_string()
+    }
+}
+
 impl fmt::Debug for TracesPlan {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "TracesPlan({} of all to {})", self.sample, self.address)

@@ -15,6 +15,7 @@ use gakp::api::{
     RuleEdit, TrackCounts,
 };
 use gakp::auth::Gate;
+use gakp::notify::{Notifier, NotifyPlan};
 use gakp::publish::{EventHub, Hub, HubConfig, Masks, Picture};
 use gakp::types::{
     BBox, CameraId, CaptureTime, ClassId, Clock, Epoch, Frame, FrameTracks, Image, MediaTime, Plane, TrackId,
@@ -197,6 +198,8 @@ pub struct Server {
     pub ready: Arc<AtomicBool>,
     stop: oneshot::Sender<()>,
     done: JoinHandle<std::io::Result<()>>,
+    /// Webhooks end with it.
+    notifier: Notifier,
 }
 
 impl Server {
@@ -240,12 +243,15 @@ impl Server {
         hub.metrics().register(&registry).unwrap();
         let ready = Arc::new(AtomicBool::new(true));
         let answer = ready.clone();
+        let listed: Arc<dyn Cameras> = cameras.clone();
+        let notifier =
+            Notifier::start(NotifyPlan::default(), &listed, &hub, &events, &registry).await.unwrap();
         let config = ApiConfig {
             cameras: cameras.clone(),
             hub: hub.clone(),
             events: events.clone(),
             history: None,
-            webhooks: vec![],
+            webhooks: notifier.webhooks(),
             registry,
             readiness: Arc::new(move || match answer.load(Ordering::SeqCst) {
                 true => vec![],
@@ -260,7 +266,7 @@ impl Server {
         let done = tokio::spawn(gakp::api::serve_with(listener, config, keep_alive, async {
             let _ = stopped.await;
         }));
-        Self { addr, hub, events, cameras, ready, stop, done }
+        Self { addr, hub, events, cameras, ready, stop, done, notifier }
     }
 
     /// Stops it and says how long that took.

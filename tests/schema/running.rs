@@ -18,6 +18,9 @@ const LIMIT: Duration = Duration::from_secs(90);
 /// Cameras that cost next to nothing and lead nowhere outside the service.
 const URLS: [&str; 2] = ["test:?fps=1&width=64&height=48", "test:?fps=2&width=96&height=64&pattern=snow"];
 
+/// A receiver that nobody is.
+const RECEIVER: &str = "http://127.0.0.1:9/hook";
+
 /// What does not end, and gRPC, which schemathesis does not speak: tests/api/grpc.rs.
 const ENDLESS: [&str; 6] = [
     "--exclude-operation-id",
@@ -35,12 +38,16 @@ fn tried(token: &str) -> Value {
     let schemas = &mut document["components"]["schemas"];
     schemas["NewCamera"]["properties"]["url"] = json!({"enum": URLS});
     schemas["CameraPatch"]["properties"]["url"] = json!({"enum": [URLS[0], URLS[1], null]});
+    for schema in ["NewWebhook", "WebhookPatch"] {
+        schemas[schema]["properties"]["url"] = json!({"enum": [RECEIVER]});
+    }
     document["components"]["parameters"]["CameraId"]["example"] = json!("demo");
     let post = |document: &mut Value, path: &str, example: Value| {
         let content = &mut document["paths"][path]["post"]["requestBody"]["content"]["application/json"];
         *content = json!({"schema": content["schema"], "example": example});
     };
     post(&mut document, "/v1/cameras", json!({"id": "new", "url": URLS[0]}));
+    post(&mut document, "/v1/webhooks", json!({"name": "alarm", "url": RECEIVER}));
     post(&mut document, "/v1/session", json!({"token": token}));
     // schemathesis takes events apart and judges each; messages.rs holds their data to its schema.
     let stream = &mut document["paths"]["/v1/tracks/stream"]["get"]["responses"]["200"]["content"];

@@ -32,7 +32,17 @@ fn every_part_is_tried_and_reported() {
         format!("off=rtsp://{}/live", refusing.address()),
         format!("film={}", film.display()),
     ];
-    let mut args = vec!["--listen", &listen, "--state-dir", state.to_str().unwrap(), "--provider", "cpu"];
+    let receiver = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let (there, off) = (receiver.local_addr().unwrap(), refusing.address());
+    let config = folder.path().join("gakp.toml");
+    let told = format!(
+        "[[webhook]]\nname = \"there\"\nurl = \"http://{there}/b4d-Wort\"\n\
+         [[webhook]]\nname = \"off\"\nurl = \"http://{off}/b4d-Wort\"\n\
+         [mqtt]\nurl = \"mqtt://guard:b4d-Wort@{off}\"\n[traces]\nendpoint = \"http://{there}\"\n"
+    );
+    std::fs::write(&config, told).unwrap();
+    let mut args = vec!["--config", config.to_str().unwrap()];
+    args.extend(["--listen", &listen, "--state-dir", state.to_str().unwrap(), "--provider", "cpu"]);
     args.extend(cameras.iter().flat_map(|camera| ["--camera", camera.as_str()]));
     let (parts, code) = report(&args);
     let of = |part: &str| {
@@ -49,6 +59,10 @@ fn every_part_is_tried_and_reported() {
         ("models", "ok", "detect"),
         ("GPU", "ok", "cpu"),
         ("history", "note", "will be made"),
+        ("webhook there", "ok", "is there"),
+        ("webhook off", "failed", "refused"),
+        ("MQTT", "failed", "refused"),
+        ("traces", "ok", "is there"),
         ("camera right", "ok", "768x576 h264"),
         ("camera wrong", "failed", "check user and password"),
         ("camera off", "failed", "refused"),

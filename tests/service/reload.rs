@@ -38,7 +38,7 @@ fn a_configuration_is_read_again() {
 
     // Again, by the API: nothing new but what takes a restart.
     let reload = || service.request("POST", "/v1/reload", None);
-    let expected = json!({"cameras": [], "certificate": false, "restart": ["max_cameras"], "failed": []});
+    let expected = json!({"cameras": [], "webhooks": [], "mqtt": false, "certificate": false, "restart": ["max_cameras"], "failed": []});
     assert_eq!(reload().json(), expected);
     // A mistake changes nothing, and is told.
     write("colour = \"red\"\n".to_owned() + &pattern("only", 5));

@@ -169,6 +169,7 @@ class Soak:
 
     def configure(self) -> None:
         broker, receiver = self.start_broker(), self.start_receiver()
+        self.receiver = receiver
         signing = self.secrets.new("webhook secret", "whsec_" + base64.b64encode(self.rng.randbytes(24)).decode())
         key = self.secret("webhook key")
         door = 'points = [[0.5, 1.0], [0.5, 0.0]]'
@@ -317,6 +318,27 @@ id = "door"
             self.ask("PUT", f"{path}/{kind}/a", self.tokens["admin"], {"id": "a", "points": shape})
         self.ask("DELETE", f"{path}/masks/a", self.tokens["admin"])
 
+    def change_webhooks(self) -> None:
+        """Right and wrong ones, of an admin and of an operator; some take posts."""
+        key, password = self.secret("webhook key"), self.secret("webhook password", "haken{}")
+        signing = self.secrets.new("webhook secret", "whsec_" + base64.b64encode(self.rng.randbytes(24)).decode())
+        url = self.rng.choice([
+            f"http://127.0.0.1:{self.receiver}/hook?key={key}", f"http://user:{password}@127.0.0.1:{free_port()}/{key}",
+            f"http://user:{password}@169.254.1.1/", f"ftp://user:{password}@127.0.0.1/", f"http://user:{password}@127.0.0.1:x/",
+        ])
+        name = next(self.names)
+        body = {"name": name, "url": url, "secret": self.rng.choice([signing, signing, signing[6:]])}
+        token = self.rng.choice([self.tokens["admin"], self.tokens["admin"], self.tokens["operator"]])
+        self.ask("POST", "/v1/webhooks", token, body)
+        self.ask("POST", "/v1/webhooks", token, self.rng.choice([json.dumps(body)[:-1], json.dumps({**body, "url": [url]})]))
+        _, _, found = self.ask("GET", "/v1/webhooks", self.tokens["admin"])
+        names = [hook["name"] for hook in json.loads(found)["webhooks"] if hook["source"] == "api"]
+        for other in names[-2:]:
+            self.ask("POST", f"/v1/webhooks/{other}/test", token)
+            self.ask("PATCH", f"/v1/webhooks/{other}", token, self.rng.choice([{"url": url}, {"secret": signing}, {"secret": None}]))
+        for other in names[:-4]:
+            self.ask("DELETE", f"/v1/webhooks/{other}", token)
+
     def sign_in_and_out(self) -> None:
         status, head, _ = self.ask("POST", "/v1/session", None, {"token": self.who()})
         cookie = next((v for n, v in head.items() if n.lower() == "set-cookie"), "").split(";")[0]
@@ -363,7 +385,9 @@ id = "door"
         password = self.secret("wrong camera password", "neu{}")
         more = f'[[camera]]\nid = "later"\nurl = "{self.camera_url(1, password)}"\n'
         broken = f'[[camera]]\nid = "later"\nurl = {self.camera_url(1, password)}\n'
-        self.config.write_text(self.text + self.rng.choice([more, broken, ""]))
+        hook = f'[[webhook]]\nname = "later"\nurl = "http://127.0.0.1:{free_port()}/{self.secret("webhook key")}"\n'
+        wrong = f'[[webhook]]\nurl = "http://127.0.0.1/"\nsecret = "{self.secret("webhook secret")}"\n'
+        self.config.write_text(self.text + self.rng.choice([more, broken, hook, wrong, ""]))
         if self.rng.random() < 0.5:
             self.service.send_signal(signal.SIGHUP)
             time.sleep(0.5)
@@ -393,7 +417,7 @@ id = "door"
         self.ask("PUT", "/v1/log", self.tokens["admin"], {"level": TRACE})
         deeds = [
             (self.read, 30), (self.misplace_a_token, 3), (self.add_camera, 8), (self.change_camera, 6), (self.remove_cameras, 2),
-            (self.draw, 3), (self.sign_in_and_out, 3), (self.revoke_a_token, 1), (self.listen, 4), (self.set_log, 2),
+            (self.draw, 3), (self.change_webhooks, 3), (self.sign_in_and_out, 3), (self.revoke_a_token, 1), (self.listen, 4), (self.set_log, 2),
             (self.reload, 1), (self.kill_a_camera, 1), (self.restart_service, 0.5),
         ]
         # Each at least once, however short it is.

@@ -132,6 +132,26 @@ export interface Bucket {
   exits?: number;
 }
 
+export interface Webhook {
+  name: string;
+  source: "configuration" | "api";
+  url: string;
+  signed: boolean;
+  cameras: string[];
+  types: string[];
+  delivered: number;
+  failed: number;
+  pending: number;
+  last_error: string | null;
+  last_error_time: string | null;
+}
+
+export interface WebhookTrial {
+  delivered: boolean;
+  error: string | null;
+  took_ms: number;
+}
+
 /** A refusal: a problem document's status, kind and detail. Status 0: the service did not answer. */
 export class ApiError extends Error {
   constructor(
@@ -176,6 +196,11 @@ async function answer(path: string, method: string, body?: unknown): Promise<Res
 /** The path of a camera, and of something of it. */
 export function cameraPath(id: string, ...rest: string[]): string {
   return ["/v1/cameras", id, ...rest].map((part, i) => (i === 0 ? part : encodeURIComponent(part))).join("/");
+}
+
+/** The path of a webhook, and of something of it. */
+export function webhookPath(name: string, ...rest: string[]): string {
+  return ["/v1/webhooks", encodeURIComponent(name), ...rest].join("/");
 }
 
 /** A query string of what is not empty. */

@@ -1,5 +1,7 @@
 // From an empty service to counts, on a real RTSP camera: what somebody does who has read nothing.
 
+import { createServer } from "node:http";
+import type { AddressInfo } from "node:net";
 import { accessible, changed, clickAt, expect, fits, given, opaque, picture, test } from "./help";
 
 test("a camera is added, seen, counted and searched", async ({ page, request }) => {
@@ -164,6 +166,49 @@ test("a camera is added, seen, counted and searched", async ({ page, request }) 
     await expect(page.locator(".events li:not([data-type='line.crossed'])")).toHaveCount(0);
     await expect(page.locator(".events li").first()).toContainText("crossed door");
     await accessible(page);
+  });
+
+  await test.step("events are sent to another system", async () => {
+    const posts: { type: string; signature: string | undefined }[] = [];
+    const receiver = createServer((message, answer) => {
+      let body = "";
+      message.on("data", (part: Buffer) => (body += part));
+      message.on("end", () => {
+        posts.push({ type: JSON.parse(body).type, signature: message.headers["webhook-signature"] as string | undefined });
+        answer.writeHead(204).end();
+      });
+    });
+    await new Promise<void>((listens) => receiver.listen(0, "127.0.0.1", listens));
+    const { port } = receiver.address() as AddressInfo;
+    try {
+      await page.getByRole("button", { name: "Add a receiver" }).click();
+      await accessible(page);
+      const form = page.getByRole("dialog");
+      await form.getByLabel("Name").fill("alarm");
+      await form.getByLabel("Address").fill("ftp://nowhere/");
+      await form.getByRole("button", { name: "Add" }).click();
+      await expect(form.getByRole("alert")).toContainText("does not begin with http://");
+      await form.getByLabel("Address").fill(`http://127.0.0.1:${port}/hook?key=T0KEN`);
+      await form.getByRole("button", { name: "Add" }).click();
+      await expect(form.locator("code")).toHaveText(/^whsec_[A-Za-z0-9+/]{43}=$/);
+      await form.getByRole("button", { name: "I have it" }).click();
+      const row = page.getByRole("row", { name: /alarm/ });
+      await expect(row).toContainText(`http://127.0.0.1:${port}/... (signed)`);
+      await page.getByRole("button", { name: "Try alarm" }).click();
+      await expect(row.getByRole("status")).toContainText("took a test message");
+      expect(posts.map(({ type }) => type)).toContain("gakp.test");
+      await expect.poll(() => posts.some(({ type }) => /^gakp\.(line|zone)\./.test(type)), { timeout: 60_000 }).toBe(true);
+      expect(posts.every(({ signature }) => signature?.startsWith("v1,"))).toBe(true);
+      await expect(row.locator("[data-label=Delivered]")).not.toHaveText("0");
+      await picture(page, "receivers");
+      await accessible(page);
+      await fits(page);
+      await page.getByRole("button", { name: "Delete alarm" }).click();
+      await expect(page.getByText("Nobody yet.")).toBeVisible();
+    } finally {
+      receiver.closeAllConnections();
+      receiver.close();
+    }
   });
 
   await test.step("the history is searched", async () => {

@@ -1,7 +1,8 @@
 import { useSignal } from "@preact/signals";
 import { EVENT_TYPES } from "../format";
-import { cameras } from "../state";
+import { cameras, mayEdit } from "../state";
 import { EventList } from "../ui/EventList";
+import { Webhooks } from "./Webhooks";
 
 export function Events() {
   const camera = useSignal("");
@@ -32,6 +33,7 @@ export function Events() {
       <section class="panel" aria-label="Events">
         <EventList camera={camera.value || undefined} type={type.value || undefined} limit={300} />
       </section>
+      {mayEdit.value && <Webhooks />}
     </>
   );
 }

@@ -453,13 +453,71 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
+        /** All webhooks, and how they fare */
+        get: operations["listWebhooks"];
+        put?: never;
         /**
-         * How webhooks fare
-         * @description Those of the configuration.
+         * Add a webhook
+         * @description Events are posted from now on; it is remembered. An operator may add receivers on the network (not this machine, not link-local addresses), an admin any.
          */
-        get: operations["webhooks"];
+        post: operations["addWebhook"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/v1/webhooks/{name}": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                /**
+                 * @description A webhook's name.
+                 * @example alarm
+                 */
+                name: components["parameters"]["WebhookName"];
+            };
+            cookie?: never;
+        };
+        /** One webhook, and how it fares */
+        get: operations["getWebhook"];
         put?: never;
         post?: never;
+        /**
+         * Remove a webhook that was added
+         * @description What waits for it is lost.
+         */
+        delete: operations["removeWebhook"];
+        options?: never;
+        head?: never;
+        /**
+         * Change a webhook that was added
+         * @description What waits for it is posted by the new settings, at once where it was waiting for another attempt.
+         */
+        patch: operations["changeWebhook"];
+        trace?: never;
+    };
+    "/v1/webhooks/{name}/test": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                /**
+                 * @description A webhook's name.
+                 * @example alarm
+                 */
+                name: components["parameters"]["WebhookName"];
+            };
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        /**
+         * Try whether the receiver takes posts
+         * @description Posts a CloudEvent of type `gakp.test` now and once, signed as events are, past those that wait. Waits ten seconds for the answer at most.
+         */
+        post: operations["testWebhook"];
         delete?: never;
         options?: never;
         head?: never;
@@ -722,7 +780,7 @@ export interface paths {
         put?: never;
         /**
          * Read the configuration and the certificate again
-         * @description As SIGHUP. Cameras that the configuration now has, has otherwise or has no more are started, changed or removed; other settings take a restart.
+         * @description As SIGHUP. Cameras, webhooks and the MQTT broker that the configuration now has, has otherwise or has no more are started, changed or removed; other settings take a restart.
          */
         post: operations["reload"];
         delete?: never;
@@ -803,7 +861,7 @@ export interface paths {
 export type webhooks = Record<string, never>;
 export interface components {
     schemas: {
-        /** @description A name of a camera, a line or a zone. */
+        /** @description A name of a camera, a line, a zone, a mask or a webhook. */
         Name: string;
         /**
          * @description An error (RFC 9457).
@@ -1254,6 +1312,10 @@ export interface components {
         Reloaded: {
             /** @description Cameras of the configuration that were started, changed or removed. */
             cameras: components["schemas"]["Name"][];
+            /** @description Webhooks of the configuration that were started, changed or removed. */
+            webhooks: components["schemas"]["Name"][];
+            /** @description Whether the MQTT broker is another, or is told otherwise. */
+            mqtt: boolean;
             /** @description Whether the certificate was read again. */
             certificate: boolean;
             /** @description Settings that differ from those in use and take a restart. */
@@ -1333,11 +1395,69 @@ export interface components {
             }[];
         };
         /**
+         * @description A webhook to be added. Unknown fields are refused.
+         * @example {
+         *       "name": "alarm",
+         *       "url": "https://hooks.example/gakp?key=T0KEN",
+         *       "secret": "whsec_MDEyMzQ1Njc4OTAxMjM0NTY3ODkwMTIzNDU2Nzg5MDE=",
+         *       "cameras": [
+         *         "gate"
+         *       ],
+         *       "types": [
+         *         "line.crossed"
+         *       ]
+         *     }
+         */
+        NewWebhook: {
+            name: components["schemas"]["Name"];
+            /** @description Where events are posted: `http://` or `https://`. May hold a login or a token; only scheme, host and port are ever shown. */
+            url: string;
+            /** @description `whsec_` and the base64 of 24 to 64 bytes: posts are signed with it. Never shown. */
+            secret?: string | null;
+            /** @description Only events of these cameras; of all where there are none. */
+            cameras?: components["schemas"]["Name"][];
+            /** @description Only events of these types; of all where there are none. */
+            types?: components["schemas"]["EventType"][];
+            /** @description How long a post may take; 10 by default. */
+            timeout_s?: number | null;
+            /** @description How long an event is tried; 3600 by default. */
+            give_up_after_s?: number | null;
+            /** @description Most events that wait; 1000 by default. */
+            queue?: number | null;
+        };
+        /** @description What of a webhook is to change; absent: stays as it is, `null`: goes back to the default. Unknown fields are refused. */
+        WebhookPatch: {
+            /** @description Another URL. */
+            url?: string;
+            /** @description Another secret; `null`: posts are not signed. */
+            secret?: string | null;
+            /** @description Other cameras; none: all. */
+            cameras?: components["schemas"]["Name"][];
+            /** @description Other types; none: all. */
+            types?: components["schemas"]["EventType"][];
+            /** @description How long a post may take. */
+            timeout_s?: number | null;
+            /** @description How long an event is tried. */
+            give_up_after_s?: number | null;
+            /** @description Most events that wait; what is too many goes, the oldest first. */
+            queue?: number | null;
+        };
+        /**
          * @description A webhook and how it fares, since the service started.
          * @example {
          *       "name": "alarm",
+         *       "source": "api",
          *       "url": "https://hooks.example/...",
          *       "signed": true,
+         *       "cameras": [
+         *         "gate"
+         *       ],
+         *       "types": [
+         *         "line.crossed"
+         *       ],
+         *       "timeout_s": 10,
+         *       "give_up_after_s": 3600,
+         *       "queue": 1000,
          *       "delivered": 120,
          *       "failed": 0,
          *       "pending": 1,
@@ -1346,11 +1466,26 @@ export interface components {
          *     }
          */
         Webhook: {
-            name: string;
+            name: components["schemas"]["Name"];
+            /**
+             * @description Who said that there is one: the configuration, where it is changed, or this API.
+             * @enum {unknown}
+             */
+            source: "configuration" | "api";
             /** @description Scheme, host and port; the rest may be secret. */
             url: string;
             /** @description Whether posts are signed. */
             signed: boolean;
+            /** @description Only events of these cameras; of all where there are none. */
+            cameras: components["schemas"]["Name"][];
+            /** @description Only events of these types; of all where there are none. */
+            types: components["schemas"]["EventType"][];
+            /** @description How long a post may take. */
+            timeout_s: number;
+            /** @description How long an event is tried. */
+            give_up_after_s: number;
+            /** @description Most events that wait. */
+            queue: number;
             /** @description Events that were delivered. */
             delivered: number;
             /** @description Events that were refused, dropped or given up. */
@@ -1361,6 +1496,25 @@ export interface components {
             last_error: string | null;
             /** Format: date-time */
             last_error_time: string | null;
+        };
+        /**
+         * @description What came of a post that only tried whether the receiver takes posts.
+         * @example {
+         *       "delivered": true,
+         *       "status": 204,
+         *       "error": null,
+         *       "took_ms": 12.5
+         *     }
+         */
+        WebhookTrial: {
+            /** @description Whether it was answered with 2xx. */
+            delivered: boolean;
+            /** @description The status of the answer, where it was delivered. */
+            status: number | null;
+            /** @description What went wrong. */
+            error: string | null;
+            /** @description How long it took, milliseconds. */
+            took_ms: number;
         };
         WebhookList: {
             webhooks: components["schemas"]["Webhook"][];
@@ -1485,6 +1639,24 @@ export interface components {
                 "application/problem+json": components["schemas"]["Problem"];
             };
         };
+        /** @description There is no such webhook. */
+        UnknownWebhook: {
+            headers: {
+                [name: string]: unknown;
+            };
+            content: {
+                "application/problem+json": components["schemas"]["Problem"];
+            };
+        };
+        /** @description The name is taken, there are as many as may be (32), or it is the configuration's. */
+        WebhookConflict: {
+            headers: {
+                [name: string]: unknown;
+            };
+            content: {
+                "application/problem+json": components["schemas"]["Problem"];
+            };
+        };
         /** @description The name is taken, or the service has as many cameras as it may. */
         CameraConflict: {
             headers: {
@@ -1600,6 +1772,11 @@ export interface components {
         OnlyState: components["schemas"]["TrackState"][];
         /** @description Only events of this type. May repeat. */
         OnlyType: components["schemas"]["EventType"][];
+        /**
+         * @description A webhook's name.
+         * @example alarm
+         */
+        WebhookName: components["schemas"]["Name"];
         /** @description Only tracks whose last detection scored at least this. */
         MinConfidence: number;
         /** @description At most so many reports of a camera per second. */
@@ -2898,7 +3075,7 @@ export interface operations {
             404: components["responses"]["UnknownCamera"];
         };
     };
-    webhooks: {
+    listWebhooks: {
         parameters: {
             query?: never;
             header?: never;
@@ -2907,7 +3084,7 @@ export interface operations {
         };
         requestBody?: never;
         responses: {
-            /** @description All of them, in the order of the configuration. */
+            /** @description Those of the configuration in its order, then those that were added. */
             200: {
                 headers: {
                     [name: string]: unknown;
@@ -2919,6 +3096,167 @@ export interface operations {
             304: components["responses"]["NotModified"];
             401: components["responses"]["Unauthenticated"];
             403: components["responses"]["Forbidden"];
+        };
+    };
+    addWebhook: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /** @description The webhook. */
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["NewWebhook"];
+            };
+        };
+        responses: {
+            /** @description Added and remembered. Whether it can be reached shows `POST /v1/webhooks/{name}/test`. */
+            201: {
+                headers: {
+                    /** @description The path of what was added. */
+                    Location: string;
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["Webhook"];
+                };
+            };
+            400: components["responses"]["BadRequest"];
+            401: components["responses"]["Unauthenticated"];
+            403: components["responses"]["Forbidden"];
+            409: components["responses"]["WebhookConflict"];
+            413: components["responses"]["TooLarge"];
+            415: components["responses"]["MediaType"];
+            500: components["responses"]["Internal"];
+        };
+    };
+    getWebhook: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                /**
+                 * @description A webhook's name.
+                 * @example alarm
+                 */
+                name: components["parameters"]["WebhookName"];
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description The webhook. */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["Webhook"];
+                };
+            };
+            304: components["responses"]["NotModified"];
+            401: components["responses"]["Unauthenticated"];
+            403: components["responses"]["Forbidden"];
+            404: components["responses"]["UnknownWebhook"];
+        };
+    };
+    removeWebhook: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                /**
+                 * @description A webhook's name.
+                 * @example alarm
+                 */
+                name: components["parameters"]["WebhookName"];
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Removed and forgotten. */
+            204: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            401: components["responses"]["Unauthenticated"];
+            403: components["responses"]["Forbidden"];
+            404: components["responses"]["UnknownWebhook"];
+            409: components["responses"]["WebhookConflict"];
+            500: components["responses"]["Internal"];
+        };
+    };
+    changeWebhook: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                /**
+                 * @description A webhook's name.
+                 * @example alarm
+                 */
+                name: components["parameters"]["WebhookName"];
+            };
+            cookie?: never;
+        };
+        /** @description What is to change. */
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["WebhookPatch"];
+            };
+        };
+        responses: {
+            /** @description The webhook as it is now. */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["Webhook"];
+                };
+            };
+            400: components["responses"]["BadRequest"];
+            401: components["responses"]["Unauthenticated"];
+            403: components["responses"]["Forbidden"];
+            404: components["responses"]["UnknownWebhook"];
+            409: components["responses"]["WebhookConflict"];
+            413: components["responses"]["TooLarge"];
+            415: components["responses"]["MediaType"];
+            500: components["responses"]["Internal"];
+        };
+    };
+    testWebhook: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                /**
+                 * @description A webhook's name.
+                 * @example alarm
+                 */
+                name: components["parameters"]["WebhookName"];
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description What came of it. */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["WebhookTrial"];
+                };
+            };
+            401: components["responses"]["Unauthenticated"];
+            403: components["responses"]["Forbidden"];
+            404: components["responses"]["UnknownWebhook"];
         };
     };
     liveEvents: {

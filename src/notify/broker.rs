@@ -1,0 +1,95 @@
+//! The MQTT sink while the service runs: started, replaced and ended as the configuration has it.
+
+use std::sync::Arc;
+
+use prometheus::Registry;
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+
+use super::Stop;
+use super::config::MqttPlan;
+use super::mqtt::{self, Figures};
+use crate::api::Cameras;
+use crate::publish::{EventHub, Hub};
+
+/// The broker that is told what happens, where there is one.
+pub(super) struct Broker {
+    cameras: Arc<dyn Cameras>,
+    hub: Hub,
+    events: EventHub,
+    registry: Registry,
+    running: Option<Running>,
+}
+
+struct Running {
+    plan: MqttPlan,
+    figures: Figures,
+    stop: watch::Sender<bool>,
+    task: JoinHandle<()>,
+}
+
+impl Running {
+    /// Lets the sink send what is pending, for a moment.
+    async fn end(self) -> Figures {
+        self.stop.send_replace(true);
+        if self.task.await.is_err() {
+            tracing::error!("the MQTT sink had failed");
+        }
+        self.figures
+    }
+}
+
+impl Broker {
+    pub fn new(cameras: &Arc<dyn Cameras>, hub: &Hub, events: &EventHub, registry: &Registry) -> Self {
+        let (cameras, hub, events, registry) =
+            (cameras.clone(), hub.clone(), events.clone(), registry.clone());
+        Self { cameras, hub, events, registry, running: None }
+    }
+
+    /// Goes by `plan` from now on; whether that is something else. What waits for a broker that is replaced and does
+    /// not come there at once is lost, and counted. There are figures only while there is a broker.
+    ///
+    /// # Errors
+    /// The figures were registered by somebody else.
+    pub async fn configure(&mut self, plan: Option<MqttPlan>) -> prometheus::Result<bool> {
+        let same = match (&self.running, &plan) {
+            (Some(running), Some(plan)) => running.plan.is_like(plan),
+            (None, None) => true,
+            _ => false,
+        };
+        if same {
+            return Ok(false);
+        }
+        let figures = match self.running.take() {
+            Some(running) => Some(running.end().await),
+            None => None,
+        };
+        match (plan, figures) {
+            (Some(plan), Some(figures)) => self.start(plan, figures),
+            (Some(plan), None) => self.start(plan, Figures::register(&self.registry)?),
+            (None, Some(figures)) => figures.unregister(&self.registry),
+            (None, None) => {}
+        }
+        Ok(true)
+    }
+
+    fn start(&mut self, plan: MqttPlan, figures: Figures) {
+        let (stop, stopped) = watch::channel(false);
+        let sink = mqtt::sink(
+            plan.clone(),
+            self.cameras.clone(),
+            &self.hub,
+            &self.events,
+            figures.clone(),
+            Stop(stopped),
+        );
+        self.running = Some(Running { plan, figures, stop, task: tokio::spawn(sink) });
+    }
+
+    /// Ends the sink.
+    pub async fn stop(&mut self) {
+        if let Some(running) = self.running.take() {
+            running.end().await;
+        }
+    }
+}
