@@ -233,12 +233,16 @@ async fn run(mut socket: WebSocket, keep_alive: KeepAlive, ticket: Ticket, mut o
         let mut sending = pin!(socket.send(message));
         let sent = match futures::poll!(&mut sending) {
             Poll::Ready(sent) => sent.is_ok(),
-            Poll::Pending => tokio::select! {
-                biased;
-                sent = timeout(SEND_TIMEOUT, sending) => matches!(sent, Ok(Ok(()))),
-                // In the middle of a message there is no saying goodbye.
-                () = &mut stopped => false,
-            },
+            Poll::Pending => {
+                // A slow client: what came in, the clock and the token are looked at after each message.
+                in_a_row = MOST_IN_A_ROW;
+                tokio::select! {
+                    biased;
+                    sent = timeout(SEND_TIMEOUT, sending) => matches!(sent, Ok(Ok(()))),
+                    // In the middle of a message there is no saying goodbye.
+                    () = &mut stopped => false,
+                }
+            }
         };
         if !sent {
             return;
