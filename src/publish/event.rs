@@ -79,7 +79,8 @@ struct Shared {
     classes: Arc<[String]>,
     listeners: broadcast::Sender<Arc<NumberedEvent>>,
     recent: Mutex<VecDeque<Arc<NumberedEvent>>>,
-    /// Seconds since 1970 when the service began: the first part of every id.
+    /// Milliseconds since 1970 when the service began: the first part of every id. A service that crashes at once and is
+    /// started again does so within a second.
     run: i64,
     next: AtomicU64,
 }
@@ -130,7 +131,7 @@ impl EventHub {
             classes,
             listeners: broadcast::channel(LAG).0,
             recent: Mutex::default(),
-            run: Timestamp::now().as_second(),
+            run: Timestamp::now().as_millisecond(),
             next: 1.into(),
         }))
     }
@@ -262,6 +263,20 @@ mod tests {
         );
         let json = message("1-1", "line.crossed", &report, &crossing(), &classes);
         assert_eq!(std::str::from_utf8(&json).unwrap(), expected);
+    }
+
+    #[test]
+    fn two_runs_of_the_same_second_number_their_events_differently() {
+        let (report, classes) = example();
+        let ids: Vec<_> = (0..2)
+            .map(|_| {
+                std::thread::sleep(std::time::Duration::from_millis(2));
+                let hub = EventHub::new(classes.clone().into());
+                hub.publish(&report, &crossing());
+                hub.recent(&EventFilter::default(), 1)[0].id.clone()
+            })
+            .collect();
+        assert_ne!(ids[0], ids[1]);
     }
 
     #[tokio::test]

@@ -1213,7 +1213,7 @@ export interface components {
         /**
          * @description What happened at a line or in a zone. Which of the fields from `track` to `occupancy` are there goes by `type`.
          * @example {
-         *       "id": "1767323000-17",
+         *       "id": "1767323000123-17",
          *       "type": "line.crossed",
          *       "camera": "gate",
          *       "epoch": 1,
@@ -3046,7 +3046,7 @@ export interface operations {
                      * @example {
                      *       "events": [
                      *         {
-                     *           "id": "1767323000-17",
+                     *           "id": "1767323000123-17",
                      *           "type": "line.crossed",
                      *           "camera": "gate",
                      *           "epoch": 1,
