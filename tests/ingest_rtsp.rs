@@ -44,13 +44,15 @@ fn indices(count: usize) -> Vec<usize> {
     (0..count).map(brightness_index).collect()
 }
 
-/// Every frame from the first to the last. Over UDP the camera's goodbye has a socket of its own and may
-/// overtake the last frame.
+/// Every frame from the first to the last. Over UDP the camera's goodbye has a socket of its own: on a busy machine it
+/// overtakes what is still under way, and one of the last two frames is lost.
 fn check_whole(seen: &Recorder, count: usize, transport: Transport, name: &str) {
-    let found = seen.indices();
-    let least = if transport == Transport::Udp { count - 1 } else { count };
-    assert!(found.len() >= least, "{name} {transport:?}: {} of {count} frames", found.len());
-    assert_eq!(found, indices(found.len().min(count)), "{name} {transport:?}");
+    let (found, mut whole) = (seen.indices(), indices(count));
+    if transport == Transport::Udp && found.len() == count - 1 {
+        let differs = found.iter().zip(&whole).position(|(found, whole)| found != whole);
+        whole.remove(differs.unwrap_or(count - 1).max(count - 2));
+    }
+    assert_eq!(found, whole, "{name} {transport:?}");
 }
 
 #[test]
