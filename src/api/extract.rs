@@ -61,6 +61,18 @@ impl<T: DeserializeOwned, S: Send + Sync> FromRequest<S> for JsonBody<T> {
     }
 }
 
+/// What was begun is done, also when who asked for it hangs up meanwhile: a handler is dropped then, half-way through
+/// what it writes and starts.
+///
+/// # Errors
+/// Its own; or that it panicked.
+pub(super) async fn to_its_end<T: Send + 'static, E: Into<Problem> + Send + 'static>(
+    work: impl Future<Output = Result<T, E>> + Send + 'static,
+) -> Result<T, Problem> {
+    let ended = tokio::spawn(work).await;
+    ended.map_err(|_| Problem::internal("the change was broken off"))?.map_err(Into::into)
+}
+
 /// A name from a path: one that is not even a name has no camera, so it is a 404 as well.
 pub(super) fn camera_id(name: &str) -> Result<CameraId, Problem> {
     CameraId::new(name).map_err(|_| Problem::unknown_camera(name))

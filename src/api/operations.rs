@@ -8,7 +8,7 @@ use futures::future::BoxFuture;
 use serde::{Deserialize, Serialize};
 
 use super::ApiState;
-use super::extract::JsonBody;
+use super::extract::{JsonBody, to_its_end};
 use super::problem::Problem;
 
 /// What can be changed while it runs, besides cameras.
@@ -72,5 +72,7 @@ pub(super) async fn set_log(
 
 /// `POST /v1/reload`: as SIGHUP.
 pub(super) async fn reload(State(state): State<ApiState>) -> Result<Json<Reloaded>, Problem> {
-    operations(&state)?.reload().await.map(Json).map_err(Problem::bad_request)
+    let operations = operations(&state)?.clone();
+    let reloaded = to_its_end(async move { operations.reload().await.map_err(Problem::bad_request) });
+    reloaded.await.map(Json)
 }

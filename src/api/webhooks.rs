@@ -6,7 +6,7 @@ use axum::response::Response;
 use axum::{Extension, Json};
 use serde::Serialize;
 
-use super::extract::{JsonBody, Path};
+use super::extract::{JsonBody, Path, to_its_end};
 use super::problem::Problem;
 use super::rest::created;
 use super::{ApiState, ssrf};
@@ -37,7 +37,8 @@ pub(super) async fn add(
 ) -> Result<Response, Problem> {
     check(identity.as_ref(), &spec.url).await?;
     let location = format!("/v1/webhooks/{}", spec.name);
-    let status = state.webhooks.add(spec, ssrf::reach(identity.as_ref())).await?;
+    let reach = ssrf::reach(identity.as_ref());
+    let status = to_its_end(async move { state.webhooks.add(spec, reach).await }).await?;
     Ok(created(location, status))
 }
 
@@ -50,14 +51,15 @@ pub(super) async fn patch(
     if let Some(url) = &patch.url {
         check(identity.as_ref(), url).await?;
     }
-    Ok(Json(state.webhooks.change(&name, patch, ssrf::reach(identity.as_ref())).await?))
+    let reach = ssrf::reach(identity.as_ref());
+    Ok(Json(to_its_end(async move { state.webhooks.change(&name, patch, reach).await }).await?))
 }
 
 pub(super) async fn remove(
     State(state): State<ApiState>,
     Path(name): Path<String>,
 ) -> Result<StatusCode, Problem> {
-    state.webhooks.remove(&name).await?;
+    to_its_end(async move { state.webhooks.remove(&name).await }).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 

@@ -18,24 +18,24 @@ pub(super) struct Broker {
     hub: Hub,
     events: EventHub,
     registry: Registry,
+    /// While there is a broker.
+    figures: Option<Figures>,
     running: Option<Running>,
 }
 
 struct Running {
     plan: MqttPlan,
-    figures: Figures,
     stop: watch::Sender<bool>,
     task: JoinHandle<()>,
 }
 
 impl Running {
     /// Lets the sink send what is pending, for a moment.
-    async fn end(self) -> Figures {
+    async fn end(self) {
         self.stop.send_replace(true);
         if self.task.await.is_err() {
             tracing::error!("the MQTT sink had failed");
         }
-        self.figures
     }
 }
 
@@ -43,7 +43,7 @@ impl Broker {
     pub fn new(cameras: &Arc<dyn Cameras>, hub: &Hub, events: &EventHub, registry: &Registry) -> Self {
         let (cameras, hub, events, registry) =
             (cameras.clone(), hub.clone(), events.clone(), registry.clone());
-        Self { cameras, hub, events, registry, running: None }
+        Self { cameras, hub, events, registry, figures: None, running: None }
     }
 
     /// Goes by `plan` from now on; whether that is something else. What waits for a broker that is replaced and does
@@ -60,30 +60,32 @@ impl Broker {
         if same {
             return Ok(false);
         }
-        let figures = match self.running.take() {
-            Some(running) => Some(running.end().await),
-            None => None,
-        };
-        match (plan, figures) {
-            (Some(plan), Some(figures)) => self.start(plan, figures),
-            (Some(plan), None) => self.start(plan, Figures::register(&self.registry)?),
-            (None, Some(figures)) => figures.unregister(&self.registry),
-            (None, None) => {}
+        if let Some(running) = self.running.take() {
+            running.end().await;
+        }
+        match plan {
+            Some(plan) => {
+                let figures = match self.figures.take() {
+                    Some(figures) => figures,
+                    None => Figures::register(&self.registry)?,
+                };
+                self.figures = Some(figures.clone());
+                self.start(plan, figures);
+            }
+            None => {
+                if let Some(figures) = self.figures.take() {
+                    figures.unregister(&self.registry);
+                }
+            }
         }
         Ok(true)
     }
 
     fn start(&mut self, plan: MqttPlan, figures: Figures) {
         let (stop, stopped) = watch::channel(false);
-        let sink = mqtt::sink(
-            plan.clone(),
-            self.cameras.clone(),
-            &self.hub,
-            &self.events,
-            figures.clone(),
-            Stop(stopped),
-        );
-        self.running = Some(Running { plan, figures, stop, task: tokio::spawn(sink) });
+        let sink =
+            mqtt::sink(plan.clone(), self.cameras.clone(), &self.hub, &self.events, figures, Stop(stopped));
+        self.running = Some(Running { plan, stop, task: tokio::spawn(sink) });
     }
 
     /// Ends the sink.

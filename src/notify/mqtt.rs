@@ -185,12 +185,14 @@ enum Turn {
 }
 
 impl Session {
-    fn open(plan: &MqttPlan, topics: &Topics) -> Result<Self, String> {
+    fn open(plan: &MqttPlan, last_will: Option<LastWill>) -> Result<Self, String> {
         let random: String = std::iter::repeat_with(fastrand::alphanumeric).take(16).collect();
         let broker = (plan.address.host.trim_matches(['[', ']']).to_owned(), plan.address.port);
         let mut options = MqttOptions::new(format!("gakp{random}"), broker);
         options.set_keep_alive(KEEP_ALIVE).set_max_packet_size(MAX_MESSAGE, MAX_MESSAGE);
-        options.set_last_will(LastWill::new(topics.status(), "offline", QoS::AtLeastOnce, true));
+        if let Some(last_will) = last_will {
+            options.set_last_will(last_will);
+        }
         if let Some(login) = &plan.login {
             options.set_credentials(login.user.clone(), login.password.clone());
         }
@@ -244,7 +246,8 @@ impl Session {
 /// # Errors
 /// Why not, in words.
 pub(super) async fn knock(plan: &MqttPlan) -> Result<(), String> {
-    let mut session = Session::open(plan, &Topics::new(plan.topic.clone()))?;
+    // Without a last will: a service that runs is not said to be gone when this breaks off.
+    let mut session = Session::open(plan, None)?;
     let answer = async {
         loop {
             match session.turn().await {
@@ -255,7 +258,6 @@ pub(super) async fn knock(plan: &MqttPlan) -> Result<(), String> {
         }
     };
     let answered = timeout(KNOCK, answer).await;
-    // Without a farewell the broker would tell the last will.
     let _ = session.client.try_disconnect();
     while let Ok(Turn::Incoming(_) | Turn::Acknowledged) = timeout(GRACE, session.turn()).await {}
     answered.unwrap_or_else(|_| Err(format!("no answer within {} s", KNOCK.as_secs())))
@@ -410,7 +412,8 @@ impl Sink {
     fn tick(&mut self) {
         self.figures.waiting.set(self.queue.len() as i64);
         if self.session.is_none() && Instant::now() >= self.next_try {
-            match Session::open(&self.plan, &self.topics) {
+            let last_will = LastWill::new(self.topics.status(), "offline", QoS::AtLeastOnce, true);
+            match Session::open(&self.plan, Some(last_will)) {
                 Ok(session) => self.session = Some(session),
                 Err(reason) => self.lost_connection(&reason),
             }

@@ -99,6 +99,7 @@ impl Address {
         let host = self.host.trim_start_matches('[').trim_end_matches(']');
         let addresses = self.reach.resolve(host, self.port).await?;
         let stream = TcpStream::connect(addresses.as_slice()).await?;
+        self.reach.admits(&stream)?;
         // Messages are small and wanted at once.
         let _ = stream.set_nodelay(true);
         let Some(tls) = tls.filter(|_| self.tls) else { return Ok(Box::new(stream)) };
@@ -186,6 +187,17 @@ mod tests {
         );
         let plain = Address::parse("http://[::1]:8080", &HTTP).unwrap();
         assert_eq!((plain.to_string().as_str(), plain.path.as_str()), ("http://[::1]:8080", "/"));
+    }
+
+    #[tokio::test]
+    async fn how_far_it_may_lead_is_asked_at_the_connection() {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let url = format!("http://{}/", listener.local_addr().unwrap());
+        let mut address = Address::parse(&url, &HTTP).unwrap();
+        assert!(address.connect(None).await.is_ok());
+        address.reach = Reach::Network;
+        let Err(refused) = address.connect(None).await else { panic!("connected") };
+        assert_eq!(refused.kind(), io::ErrorKind::PermissionDenied);
     }
 
     #[test]

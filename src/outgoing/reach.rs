@@ -7,6 +7,8 @@
 use std::io;
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 
+use tokio::net::TcpStream;
+
 /// How far a connection may go.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Reach {
@@ -26,13 +28,28 @@ impl Reach {
         let host = host.trim_start_matches('[').trim_end_matches(']');
         let found: Vec<_> = tokio::net::lookup_host((host, port)).await?.collect();
         if self == Reach::Network && found.iter().any(|address| is_inside(address.ip())) {
-            return Err(io::Error::new(
-                io::ErrorKind::PermissionDenied,
-                "the address is this machine's own or link-local, which only an admin may name",
-            ));
+            return Err(refusal());
         }
         Ok(found)
     }
+
+    /// Whether a connection may be used: one from an address to itself has not left the machine, whatever its name.
+    ///
+    /// # Errors
+    /// It may not ([`io::ErrorKind::PermissionDenied`]).
+    pub fn admits(self, stream: &TcpStream) -> io::Result<()> {
+        if self == Reach::Network && stream.peer_addr()?.ip() == stream.local_addr()?.ip() {
+            return Err(refusal());
+        }
+        Ok(())
+    }
+}
+
+fn refusal() -> io::Error {
+    io::Error::new(
+        io::ErrorKind::PermissionDenied,
+        "the address is this machine's own or link-local, which only an admin may name",
+    )
 }
 
 /// Whether an address is this machine's own, link-local, or no host's at all.
@@ -49,7 +66,12 @@ fn is_inside(address: IpAddr) -> bool {
         IpAddr::V6(v6) => match embedded(v6) {
             Some(v4) => is_inside(v4),
             None => {
-                v6.is_loopback() || v6.is_unspecified() || v6.is_unicast_link_local() || v6.is_multicast()
+                v6.is_loopback()
+                    || v6.is_unspecified()
+                    || v6.is_unicast_link_local()
+                    || v6.is_multicast()
+                    // A cloud's metadata server.
+                    || v6.segments() == [0xfd00, 0xec2, 0, 0, 0, 0, 0, 0x254]
             }
         },
     }
@@ -82,6 +104,7 @@ mod tests {
             ("[::ffff:127.0.0.1]", false),
             ("[64:ff9b::7f00:1]", false),
             ("[fe80::1]", false),
+            ("[fd00:ec2::254]", false),
             ("2130706433", false),
         ] {
             let found = Reach::Network.resolve(host, 80).await;

@@ -1,10 +1,9 @@
 //! Webhooks that are added, changed, tried and removed while the service runs.
 
-use axum::http::StatusCode;
+use axum::http::{StatusCode, header};
 use axum::response::IntoResponse;
 use gakp::types::BBox;
 use serde_json::{Value, json};
-use tokio::net::TcpListener;
 
 use super::auth::Tokens;
 use super::receiver::*;
@@ -81,13 +80,15 @@ async fn a_webhook_is_added_tried_changed_and_removed() {
     assert_eq!(lines(&posts), ["a", "c"], "b was not asked for");
     assert!(posts.lock().unwrap()[1].headers.get("webhook-signature").is_none());
 
-    // A receiver that is gone: what waits is kept, and posted at once when the URL is mended.
-    let gone = TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
-    let patch = json!({"url": format!("http://{gone}/T0KEN")});
+    // A receiver that wants to be left alone for an hour: what waits is kept, and posted at once when the URL is mended.
+    let (busy, _) =
+        receiver(|_| (StatusCode::TOO_MANY_REQUESTS, [(header::RETRY_AFTER, "3600")]).into_response());
+    let busy = listen(busy).await;
+    let patch = json!({"url": format!("http://{busy}/hooks/T0KEN")});
     assert_eq!(server.send("PATCH", "/v1/webhooks/alarm", &patch).await.status, 200);
     let trial = server.send("POST", "/v1/webhooks/alarm/test", &Value::Null).await.json();
     assert!(
-        trial["delivered"] == false && trial["error"].as_str().unwrap().contains("cannot connect"),
+        trial["delivered"] == false && trial["error"].as_str().unwrap().contains("answered 429"),
         "{trial}"
     );
     for line in ["d", "e", "f"] {

@@ -76,9 +76,10 @@ pub(super) async fn deliver(account: Arc<Account>, mut plans: Plans, stop: Stop)
     let poster = Poster::new(plan.address.clone(), plan.tls.clone());
     let worker = Worker { poster, plan, plans, account: account.clone(), stop, failures: 0 };
     tokio::select! {
+        biased;
+        () = removed => {}
         () = worker.run() => {}
         () = over => {}
-        () = removed => {}
     }
     let left = account.queue.clear();
     account.count(Outcome::Stopped, left);
@@ -105,11 +106,7 @@ impl Worker {
     /// Until the queue is closed and empty, or an attempt fails while the service stops.
     async fn run(mut self) {
         while let Some(Waiting { event, .. }) = self.account.queue.next().await {
-            if self.plans.has_changed().unwrap_or(false) {
-                self.plan = self.plans.borrow_and_update().clone();
-                self.poster = Poster::new(self.plan.address.clone(), self.plan.tls.clone());
-                self.failures = 0;
-            }
+            self.take_up();
             let message = body(&event).map_err(MessageError::from);
             let attempt = match message.and_then(|body| Message::new(&event.id, body, &self.plan)) {
                 Ok(message) => attempt(&mut self.poster, message, self.plan.timeout).await,
@@ -138,6 +135,9 @@ impl Worker {
             if self.stop.is_stopping() {
                 return;
             }
+            if self.take_up() {
+                continue;
+            }
             self.expire();
             let until = Instant::now() + wait;
             tokio::select! {
@@ -145,10 +145,22 @@ impl Worker {
                 // One last attempt.
                 () = self.stop.stopped() => {}
                 // Perhaps the new settings work.
-                _ = self.plans.changed() => self.plans.mark_changed(),
+                Ok(()) = self.plans.changed() => self.plans.mark_changed(),
             }
+            self.take_up();
             self.expire();
         }
+    }
+
+    /// Goes by the newest plan; whether it is another.
+    fn take_up(&mut self) -> bool {
+        let changed = self.plans.has_changed().unwrap_or(false);
+        if changed {
+            self.plan = self.plans.borrow_and_update().clone();
+            self.poster = Poster::new(self.plan.address.clone(), self.plan.tls.clone());
+            self.failures = 0;
+        }
+        changed
     }
 
     fn settled(&mut self, outcome: Outcome) {
