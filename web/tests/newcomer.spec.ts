@@ -204,6 +204,12 @@ test("a camera is added, seen, counted and searched", async ({ page, request }) 
       await accessible(page);
       await fits(page);
       await page.getByRole("button", { name: "Delete alarm" }).click();
+      const asked = page.getByRole("dialog", { name: "Delete alarm?" });
+      await asked.getByRole("button", { name: "Keep it" }).click();
+      await expect(asked).toBeHidden();
+      await expect(row).toBeVisible();
+      await page.getByRole("button", { name: "Delete alarm" }).click();
+      await asked.getByRole("button", { name: "Delete the receiver" }).click();
       await expect(page.getByText("Nobody yet.")).toBeVisible();
     } finally {
       receiver.closeAllConnections();

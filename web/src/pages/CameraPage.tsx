@@ -11,11 +11,12 @@ import { LiveView } from "../live/LiveView";
 import type { Shown } from "../live/stage";
 import { go } from "../route";
 import { awake, cameras, mayEdit, mayHide, refresh } from "../state";
+import { Deletion } from "../ui/Deletion";
 import { EventList } from "../ui/EventList";
 import { State } from "../ui/State";
 import { CountChart } from "./CountChart";
 import { CountPanel } from "./CountPanel";
-import { DeleteCamera, EditCamera } from "./EditCamera";
+import { EditCamera } from "./EditCamera";
 import { remember } from "./samples";
 
 const COUNT_MS = 1000;
@@ -197,14 +198,18 @@ function Open({ camera }: { camera: Camera }) {
       </div>
       {dialog.value === "edit" && <EditCamera camera={camera} close={() => (dialog.value = null)} />}
       {dialog.value === "delete" && (
-        <DeleteCamera
-          camera={camera}
+        <Deletion
+          name={camera.id}
+          what="camera"
+          path={cameraPath(camera.id)}
           close={() => (dialog.value = null)}
           gone={() => {
             refresh();
             go("#/");
           }}
-        />
+        >
+          The camera, its lines and zones and their counts are forgotten.
+        </Deletion>
       )}
     </div>
   );

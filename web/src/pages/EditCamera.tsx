@@ -44,36 +44,3 @@ export function EditCamera({ camera, close }: { camera: Camera; close: () => voi
     </Dialog>
   );
 }
-
-export function DeleteCamera(props: { camera: Camera; close: () => void; gone: () => void }) {
-  const { camera, close, gone } = props;
-  const error = useSignal("");
-  const busy = useSignal(false);
-  const remove = async () => {
-    busy.value = true;
-    try {
-      await ask(cameraPath(camera.id), "DELETE");
-      close();
-      gone();
-    } catch (problem) {
-      error.value = words(problem);
-      busy.value = false;
-    }
-  };
-  return (
-    <Dialog title={`Delete ${camera.id}?`} close={close}>
-      <p>The camera, its lines and zones and their counts are forgotten.</p>
-      <p role="alert" class="bad">
-        {error.value}
-      </p>
-      <div class="row">
-        <button type="button" class="danger" disabled={busy.value} onClick={() => void remove()}>
-          Delete the camera
-        </button>
-        <button type="button" autofocus onClick={close}>
-          Keep it
-        </button>
-      </div>
-    </Dialog>
-  );
-}

@@ -3,6 +3,7 @@ import { useEffect } from "preact/hooks";
 import { ask, webhookPath, words, type Webhook, type WebhookTrial } from "../api";
 import { EVENT_TYPES, moment, number } from "../format";
 import { awake, cameras } from "../state";
+import { Deletion } from "../ui/Deletion";
 import { Dialog } from "../ui/Dialog";
 import { FormEnd } from "../ui/FormEnd";
 
@@ -13,6 +14,7 @@ export function Webhooks() {
   const hooks = useSignal<Webhook[] | null>(null);
   const error = useSignal("");
   const adding = useSignal(false);
+  const deleting = useSignal<string | null>(null);
   /** What came of trying one, by its name. */
   const trials = useSignal<Record<string, string>>({});
   const look = async () => {
@@ -34,14 +36,6 @@ export function Webhooks() {
     try {
       const trial = await ask<WebhookTrial>(webhookPath(name, "test"), "POST");
       tell(name, trial.delivered ? `It took a test message in ${trial.took_ms.toFixed(0)} ms.` : `It did not work: ${trial.error}.`);
-    } catch (problem) {
-      tell(name, words(problem));
-    }
-    void look();
-  };
-  const remove = async (name: string) => {
-    try {
-      await ask(webhookPath(name), "DELETE");
     } catch (problem) {
       tell(name, words(problem));
     }
@@ -94,7 +88,7 @@ export function Webhooks() {
                         Try
                       </button>
                       {hook.source === "api" ? (
-                        <button type="button" class="danger" aria-label={`Delete ${hook.name}`} onClick={() => void remove(hook.name)}>
+                        <button type="button" class="danger" aria-label={`Delete ${hook.name}`} onClick={() => (deleting.value = hook.name)}>
                           Delete
                         </button>
                       ) : (
@@ -108,6 +102,17 @@ export function Webhooks() {
             </tbody>
           </table>
         </div>
+      )}
+      {deleting.value !== null && (
+        <Deletion
+          name={deleting.value}
+          what="receiver"
+          path={webhookPath(deleting.value)}
+          close={() => (deleting.value = null)}
+          gone={() => void look()}
+        >
+          It is told nothing more. What waits for it, and the secret that its messages are signed with, are forgotten.
+        </Deletion>
       )}
       {adding.value && (
         <AddWebhook
