@@ -5,9 +5,7 @@
 //! and receivers are, so those are allowed.
 
 use std::io;
-use std::net::{IpAddr, Ipv6Addr, SocketAddr};
-
-use tokio::net::TcpStream;
+use std::net::{IpAddr, Ipv6Addr, SocketAddr, UdpSocket};
 
 /// How far a connection may go.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -27,32 +25,23 @@ impl Reach {
     pub async fn resolve(self, host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
         let host = host.trim_start_matches('[').trim_end_matches(']');
         let found: Vec<_> = tokio::net::lookup_host((host, port)).await?.collect();
-        if self == Reach::Network && found.iter().any(|address| is_inside(address.ip())) {
-            return Err(refusal());
+        let is_out_of_reach = |ip| is_inside(ip) || is_own(ip);
+        if self == Reach::Network && found.iter().any(|address| is_out_of_reach(address.ip())) {
+            return Err(io::Error::new(
+                io::ErrorKind::PermissionDenied,
+                "the address is this machine's own or link-local, which only an admin may name",
+            ));
         }
         Ok(found)
     }
-
-    /// Whether a connection may be used: one from an address to itself has not left the machine, whatever its name.
-    ///
-    /// # Errors
-    /// It may not ([`io::ErrorKind::PermissionDenied`]).
-    pub fn admits(self, stream: &TcpStream) -> io::Result<()> {
-        if self == Reach::Network && stream.peer_addr()?.ip() == stream.local_addr()?.ip() {
-            return Err(refusal());
-        }
-        Ok(())
-    }
 }
 
-fn refusal() -> io::Error {
-    io::Error::new(
-        io::ErrorKind::PermissionDenied,
-        "the address is this machine's own or link-local, which only an admin may name",
-    )
+/// Whether an interface of this machine has the address: only such a one can be bound. Nothing is sent.
+fn is_own(address: IpAddr) -> bool {
+    UdpSocket::bind((address, 0)).is_ok()
 }
 
-/// Whether an address is this machine's own, link-local, or no host's at all.
+/// Whether an address is of a kind that does not leave this machine, is link-local, or is no host's at all.
 fn is_inside(address: IpAddr) -> bool {
     match address {
         IpAddr::V4(v4) => {
@@ -88,6 +77,24 @@ fn embedded(v6: Ipv6Addr) -> Option<IpAddr> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// The address that the machine has on its network, as the routes say it. There may be none.
+    fn own_address() -> Option<IpAddr> {
+        let socket = UdpSocket::bind(("0.0.0.0", 0)).ok()?;
+        socket.connect(("198.51.100.1", 9)).ok()?;
+        socket.local_addr().ok().map(|address| address.ip())
+    }
+
+    #[tokio::test]
+    async fn this_machines_address_on_the_network_is_its_own() {
+        assert!(is_own(IpAddr::from([127, 0, 0, 1])) && !is_own(IpAddr::from([198, 51, 100, 1])));
+        let Some(own) = own_address() else {
+            eprintln!("SKIPPED: the machine is on no network");
+            return;
+        };
+        let refused = Reach::Network.resolve(&own.to_string(), 80).await.unwrap_err();
+        assert_eq!(refused.kind(), io::ErrorKind::PermissionDenied, "{own}");
+    }
 
     #[tokio::test]
     async fn this_machine_is_out_of_reach_and_the_network_is_not() {
