@@ -233,6 +233,55 @@ fn a_broker_may_speak_tls_to_those_who_trust_it() {
     assert!(!log.contains(PASSWORD) && !log.contains("T0KEN"), "{log}");
 }
 
+/// A broker that is told otherwise, and one that lets nobody in for a while: the next has what the one before did not
+/// take, and what happened in between.
+#[test]
+fn no_event_is_lost_between_a_broker_and_the_next() {
+    let Some(broker) = Broker::start() else { return };
+    let state = tempfile::tempdir().unwrap();
+    let Some(service) = service(state.path(), &broker, "") else { return };
+    let (file, secret) = (state.path().join("gakp.toml"), state.path().join("broker.password"));
+    let listener = broker.listen("gakp/#");
+    let ids = |events: Vec<String>| -> Vec<String> {
+        let id =
+            |text: &String| serde_json::from_str::<Value>(text).unwrap()["id"].as_str().unwrap().to_owned();
+        events.iter().map(id).collect()
+    };
+    let happened = || -> Vec<String> {
+        let events = service.get("/v1/events?limit=1000").json()["events"].clone();
+        ids(events.as_array().unwrap().iter().rev().map(Value::to_string).collect())
+    };
+    let more = |what: &str| {
+        let before = happened().len();
+        eventually(what, || (happened().len() > before).then_some(()));
+    };
+    let reload = || assert_eq!(service.request("POST", "/v1/reload", None).json()["mqtt"], true);
+    eventually("the first event", || (!listener.all("gakp/demo/event").is_empty()).then_some(()));
+    std::fs::write(&secret, "wrong").unwrap();
+    reload();
+    more("an event while nobody is let in");
+    std::fs::write(&secret, PASSWORD).unwrap();
+    reload();
+    let config = std::fs::read_to_string(&file).unwrap();
+    for rate in [2, 3, 4] {
+        std::fs::write(&file, config.replace("[mqtt]\n", &format!("[mqtt]\nmax_rate = {rate}\n"))).unwrap();
+        reload();
+    }
+    more("an event by the last one");
+    let all = happened();
+    let mut told = eventually("all of them", || {
+        let told = ids(listener.all("gakp/demo/event"));
+        told.contains(all.last().unwrap()).then_some(told)
+    });
+    // What the listener came too late for; and at least once may be twice.
+    let first = all.iter().position(|id| *id == told[0]).unwrap();
+    let mut seen = std::collections::BTreeSet::new();
+    told.retain(|id| seen.insert(id.clone()));
+    assert_eq!(told[..all.len() - first], all[first..]);
+    assert_eq!(service.metrics().get("gakp_mqtt_messages_total{kind=\"event\",outcome=\"dropped\"}"), 0.0);
+    service.stop();
+}
+
 #[test]
 fn a_broker_comes_and_goes_with_the_configuration() {
     let Some(broker) = Broker::start() else { return };

@@ -8,7 +8,7 @@ use tokio::task::JoinHandle;
 
 use super::Stop;
 use super::config::MqttPlan;
-use super::mqtt::{self, Figures};
+use super::mqtt::{self, Figures, Remains};
 use crate::api::Cameras;
 use crate::publish::{EventHub, Hub};
 
@@ -26,16 +26,15 @@ pub(super) struct Broker {
 struct Running {
     plan: MqttPlan,
     stop: watch::Sender<bool>,
-    task: JoinHandle<()>,
+    task: JoinHandle<Remains>,
 }
 
 impl Running {
-    /// Lets the sink send what is pending, for a moment.
-    async fn end(self) {
+    /// Lets the sink send what is pending, for a moment; what it leaves.
+    async fn end(self) -> Option<Remains> {
         self.stop.send_replace(true);
-        if self.task.await.is_err() {
-            tracing::error!("the MQTT sink had failed");
-        }
+        let ended = self.task.await;
+        ended.inspect_err(|_| tracing::error!("the MQTT sink had failed; what waited for it is lost")).ok()
     }
 }
 
@@ -46,8 +45,9 @@ impl Broker {
         Self { cameras, hub, events, registry, figures: None, running: None }
     }
 
-    /// Goes by `plan` from now on; whether that is something else. What waits for a broker that is replaced and does
-    /// not come there at once is lost, and counted. There are figures only while there is a broker.
+    /// Goes by `plan` from now on; whether that is something else. What waits for a broker that is replaced, and what
+    /// happens meanwhile, goes to the next; without a next it is lost, and counted. There are figures only while there
+    /// is a broker.
     ///
     /// # Errors
     /// The figures were registered by somebody else.
@@ -60,9 +60,7 @@ impl Broker {
         if same {
             return Ok(false);
         }
-        if let Some(running) = self.running.take() {
-            running.end().await;
-        }
+        let remains = self.end().await;
         match plan {
             Some(plan) => {
                 let figures = match self.figures.take() {
@@ -70,10 +68,13 @@ impl Broker {
                     None => Figures::register(&self.registry)?,
                 };
                 self.figures = Some(figures.clone());
-                self.start(plan, figures);
+                self.start(plan, figures, remains.unwrap_or_else(|| Remains::none(&self.events)));
             }
             None => {
                 if let Some(figures) = self.figures.take() {
+                    if let Some(remains) = remains {
+                        remains.give_up(&figures, "there is no broker any more");
+                    }
                     figures.unregister(&self.registry);
                 }
             }
@@ -81,17 +82,23 @@ impl Broker {
         Ok(true)
     }
 
-    fn start(&mut self, plan: MqttPlan, figures: Figures) {
+    async fn end(&mut self) -> Option<Remains> {
+        match self.running.take() {
+            Some(running) => running.end().await,
+            None => None,
+        }
+    }
+
+    fn start(&mut self, plan: MqttPlan, figures: Figures, remains: Remains) {
         let (stop, stopped) = watch::channel(false);
-        let sink =
-            mqtt::sink(plan.clone(), self.cameras.clone(), &self.hub, &self.events, figures, Stop(stopped));
+        let sink = mqtt::sink(plan.clone(), self.cameras.clone(), &self.hub, remains, figures, Stop(stopped));
         self.running = Some(Running { plan, stop, task: tokio::spawn(sink) });
     }
 
-    /// Ends the sink.
+    /// Ends the sink; what is left then is lost, and counted.
     pub async fn stop(&mut self) {
-        if let Some(running) = self.running.take() {
-            running.end().await;
+        if let (Some(remains), Some(figures)) = (self.end().await, &self.figures) {
+            remains.give_up(figures, "the service stops");
         }
     }
 }

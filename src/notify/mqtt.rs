@@ -100,18 +100,48 @@ impl Figures {
     }
 }
 
-/// The MQTT sink, to be run as a task.
+/// What a sink that has ended leaves to the next.
+pub(super) struct Remains {
+    listener: EventListener,
+    /// Events that were not acknowledged, in order.
+    queue: VecDeque<Arc<NumberedEvent>>,
+}
+
+impl Remains {
+    /// Nothing; it hears what happens from now on.
+    pub(super) fn none(events: &EventHub) -> Self {
+        Self { listener: events.listen(EventFilter::default()), queue: VecDeque::new() }
+    }
+
+    /// Nobody comes to send it: it is counted and told as lost.
+    pub(super) fn give_up(mut self, figures: &Figures, reason: &str) {
+        let mut lost = self.queue.len() as u64;
+        while let Some(heard) = self.listener.try_next() {
+            lost += match heard {
+                Heard::Event(_) => 1,
+                Heard::Missed(missed) => missed,
+            };
+        }
+        figures.waiting.set(0);
+        figures.count("event", "dropped", lost);
+        if lost > 0 {
+            tracing::warn!(lost, reason, "MQTT loses events");
+        }
+    }
+}
+
+/// The MQTT sink, to be run as a task. It goes on with what another has left, and ends with what it leaves itself.
 pub(super) fn sink(
     plan: MqttPlan,
     cameras: Arc<dyn Cameras>,
     hub: &Hub,
-    events: &EventHub,
+    remains: Remains,
     figures: Figures,
     stop: Stop,
-) -> impl Future<Output = ()> + Send + use<> {
+) -> impl Future<Output = Remains> + Send + use<> {
     let frames = plan.tracks || plan.onvif;
     let subscription = frames.then(|| hub.subscribe(publish::Only::All));
-    let listener = events.listen(EventFilter::default());
+    let Remains { listener, queue } = remains;
     let topics = Topics::new(plan.topic.clone());
     let discovery = plan.discovery.clone().map(Discovery::new);
     tracing::info!(broker = %plan.address, topic = plan.topic, "events go to MQTT");
@@ -122,7 +152,7 @@ pub(super) fn sink(
         discovery,
         classes: hub.classes().clone(),
         figures,
-        queue: VecDeque::new(),
+        queue,
         under_way: 0,
         latest: BTreeMap::new(),
         ledger: Ledger::default(),
@@ -285,7 +315,7 @@ impl Sink {
         mut listener: EventListener,
         mut subscription: Option<Subscription>,
         mut stop: Stop,
-    ) {
+    ) -> Remains {
         let mut tick = interval(self.plan.every.clamp(Duration::from_millis(100), Duration::from_secs(1)));
         let mut frames = interval(self.plan.tracks_every);
         tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -310,10 +340,10 @@ impl Sink {
                 _ = frames.tick(), if subscription.is_some() => self.send_frames(),
             }
         }
-        while let Some(Some(heard)) = listener.next().now_or_never() {
+        while let Some(heard) = listener.try_next() {
             self.hear(heard);
         }
-        self.finish().await;
+        Remains { listener, queue: self.finish().await }
     }
 
     fn is_connected(&self) -> bool {
@@ -483,8 +513,8 @@ impl Sink {
         }
     }
 
-    /// Sends what waits, says goodbye, and tells what was lost.
-    async fn finish(mut self) {
+    /// Sends what waits and says goodbye; what is left.
+    async fn finish(mut self) -> VecDeque<Arc<NumberedEvent>> {
         let deadline = (Instant::now() + GRACE).into();
         self.send_events();
         while self.is_connected() && self.under_way > 0 {
@@ -506,10 +536,6 @@ impl Sink {
             }
         }
         self.figures.connected.set(0);
-        let left = self.queue.len() as u64;
-        if left > 0 {
-            self.losses = Sparing::default();
-            self.lose(left, "the service stops");
-        }
+        self.queue
     }
 }

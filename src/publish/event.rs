@@ -194,6 +194,21 @@ impl EventListener {
             }
         }
     }
+
+    /// The next event that it wants, if there is one by now. Unlike [`EventListener::next`] it is no part of the
+    /// cooperation between tasks, which ends a loop over what is there after a hundred.
+    pub fn try_next(&mut self) -> Option<Heard> {
+        loop {
+            match self.events.try_recv() {
+                Ok(event) if self.filter.wants(&event) => return Some(Heard::Event(event)),
+                Ok(_) => {}
+                Err(broadcast::error::TryRecvError::Lagged(missed)) => return Some(Heard::Missed(missed)),
+                Err(broadcast::error::TryRecvError::Empty | broadcast::error::TryRecvError::Closed) => {
+                    return None;
+                }
+            }
+        }
+    }
 }
 
 fn message(
