@@ -83,3 +83,25 @@ pub(super) fn known_camera(state: &ApiState, name: &str) -> Result<CameraId, Pro
     let id = CameraId::new(name)?;
     state.cameras.get(&id).map(|_| id).ok_or_else(|| Problem::unknown_camera(name))
 }
+
+#[cfg(test)]
+mod tests {
+    use tokio::sync::oneshot;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn what_was_begun_is_done_when_nobody_waits_any_more() {
+        let ((go, gone), (done, is_done)) = (oneshot::channel(), oneshot::channel());
+        let mut work = Box::pin(to_its_end(async move {
+            gone.await.map_err(|_| Problem::internal("never sent"))?;
+            done.send("done").map_err(Problem::internal)
+        }));
+        assert!(futures::poll!(&mut work).is_pending());
+        drop(work);
+        go.send(()).unwrap();
+        assert_eq!(is_done.await, Ok("done"));
+        let broken: Result<(), Problem> = to_its_end(async { Err(Problem::bad_request("its own")) }).await;
+        assert!(format!("{broken:?}").contains("its own"), "{broken:?}");
+    }
+}

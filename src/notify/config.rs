@@ -17,6 +17,12 @@ use crate::types::{CameraId, is_name};
 const MQTT: [Scheme; 2] =
     [Scheme { name: "mqtt", tls: false, port: 1883 }, Scheme { name: "mqtts", tls: true, port: 8883 }];
 
+/// How long a post of a webhook may take unless it says otherwise, seconds.
+pub(super) const WEBHOOK_TIMEOUT_S: f64 = 10.0;
+/// How long an event is tried unless its webhook says otherwise, seconds.
+pub(super) const WEBHOOK_GIVE_UP_AFTER_S: f64 = 3600.0;
+/// Most events that wait for a webhook unless it says otherwise.
+pub(super) const WEBHOOK_QUEUE: usize = 1000;
 /// What stands before the base64 of a webhook's secret.
 const SECRET_PREFIX: &str = "whsec_";
 
@@ -90,6 +96,8 @@ pub struct NotifyError {
 #[derive(Clone)]
 pub struct WebhookPlan {
     pub(super) name: String,
+    /// Whether the name was given; otherwise it is its place among the others.
+    pub(super) named: bool,
     pub(super) address: Address,
     pub(super) key: Option<ring::hmac::Key>,
     pub(super) filter: EventFilter,
@@ -248,13 +256,14 @@ impl WebhookOptions {
                 .kinds
                 .insert(kind.ok_or_else(|| format!("type {given:?} is none of {}", EVENT_KINDS.join(", ")))?);
         }
-        let queue = self.queue.unwrap_or(1000);
+        let queue = self.queue.unwrap_or(WEBHOOK_QUEUE);
         if !(1..=100_000).contains(&queue) {
             return Err(format!("queue = {queue}: must be from 1 to 100000"));
         }
         let ca_file = self.ca_file.map(|file| folder.join(file));
         Ok(WebhookPlan {
             name,
+            named: self.name.is_some(),
             made_of: (
                 secret.as_deref().map(Secret::from),
                 ca_file.as_deref().and_then(|file| fs::read(file).ok()),
@@ -263,8 +272,13 @@ impl WebhookOptions {
             address,
             key,
             filter,
-            timeout: seconds("timeout_s", self.timeout_s, 10.0, 300.0)?,
-            give_up: seconds("give_up_after_s", self.give_up_after_s, 3600.0, 7.0 * 86400.0)?,
+            timeout: seconds("timeout_s", self.timeout_s, WEBHOOK_TIMEOUT_S, 300.0)?,
+            give_up: seconds(
+                "give_up_after_s",
+                self.give_up_after_s,
+                WEBHOOK_GIVE_UP_AFTER_S,
+                7.0 * 86400.0,
+            )?,
             queue,
         })
     }

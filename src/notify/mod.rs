@@ -29,8 +29,8 @@ use tokio::time::timeout;
 
 pub use config::{MqttOptions, MqttPlan, NotifyError, WebhookOptions, WebhookPlan};
 pub use webhook::{
-    RememberedWebhooks, WebhookError, WebhookPatch, WebhookSource, WebhookSpec, WebhookStatus, WebhookTrial,
-    Webhooks,
+    RememberedWebhooks, WebhookError, WebhookPatch, WebhookSettings, WebhookSource, WebhookSpec,
+    WebhookStatus, WebhookTrial, Webhooks,
 };
 
 use crate::api::Cameras;
@@ -70,12 +70,13 @@ impl NotifyPlan {
     /// Tries whether all of them can be reached, at the same time: for each its name, where it is, and what is wrong.
     /// Nothing is posted or published.
     pub async fn knock(&self) -> Vec<(String, String, Result<(), String>)> {
-        let webhooks = self.webhooks.iter().chain(self.remembered.plans()).map(|plan| async move {
-            (
-                format!("webhook {}", plan.name),
-                plan.address.to_string(),
-                plan.address.knock(plan.tls.as_ref()).await,
-            )
+        let configured = self.webhooks.iter().map(|plan| (&*plan.name, Ok(plan)));
+        let webhooks = configured.chain(self.remembered.plans()).map(|(name, plan)| async move {
+            let (address, found) = match plan {
+                Ok(plan) => (plan.address.to_string(), plan.address.knock(plan.tls.as_ref()).await),
+                Err(why) => ("webhooks.json".to_owned(), Err(why.to_owned())),
+            };
+            (format!("webhook {name}"), address, found)
         });
         let broker = self.mqtt.iter().map(|plan| async move {
             ("MQTT".to_owned(), plan.address.to_string(), mqtt::knock(plan).await)

@@ -123,6 +123,42 @@ async fn a_webhook_is_added_tried_changed_and_removed() {
     server.stop().await;
 }
 
+/// A receiver that takes a post and says nothing, for as long as five minutes: neither a change nor a removal waits for
+/// it.
+#[tokio::test]
+async fn a_hanging_post_holds_nothing_up() {
+    let server = Server::start().await;
+    let (hanging, taken) = receiver(|_| [("x-hang", "")].into_response());
+    let (router, posts) = receiver(ok);
+    let (silent, address) = (listen(hanging).await, listen(router).await);
+    let (silent, url) = (format!("http://{silent}/hooks/a"), format!("http://{address}/hooks/a"));
+    let added = json!({"name": "alarm", "url": silent, "timeout_s": 300});
+    assert_eq!(server.send("POST", "/v1/webhooks", &added).await.status, 201);
+    for line in ["a", "b"] {
+        server.cross(line);
+    }
+    eventually("the post", || taken.lock().unwrap().len() == 1).await;
+    // What is told of it changes: the post stays where it is.
+    let patch = json!({"types": ["line.crossed"], "queue": 7});
+    assert_eq!(server.send("PATCH", "/v1/webhooks/alarm", &patch).await.json()["pending"], 2);
+    // Where it goes changes: the post that hangs is made there, too.
+    assert_eq!(server.send("PATCH", "/v1/webhooks/alarm", &json!({"url": url})).await.status, 200);
+    soon("both events", async || server.webhook("alarm").await["delivered"] == 2).await;
+    assert_eq!((lines(&taken), lines(&posts)), (vec!["a".to_owned()], vec!["a".to_owned(), "b".to_owned()]));
+
+    // Back, and deleted while it hangs.
+    assert_eq!(server.send("PATCH", "/v1/webhooks/alarm", &json!({"url": silent})).await.status, 200);
+    server.cross("c");
+    eventually("the next post", || taken.lock().unwrap().len() == 2).await;
+    assert_eq!(server.send("DELETE", "/v1/webhooks/alarm", &Value::Null).await.status, 204);
+    let added = json!({"name": "alarm", "url": url});
+    assert_eq!(server.send("POST", "/v1/webhooks", &added).await.status, 201);
+    server.cross("d");
+    soon("its event", async || server.webhook("alarm").await["delivered"] == 1).await;
+    assert_eq!(lines(&posts), ["a", "b", "d"]);
+    server.stop().await;
+}
+
 #[tokio::test]
 async fn what_is_wrong_with_a_webhook_is_said_without_its_secrets() {
     let server = Server::start().await;

@@ -96,6 +96,29 @@ fn webhooks_are_remembered_and_those_of_the_configuration_read_again() {
     assert_eq!(service.delete("/v1/webhooks/added").status, 204);
     service.stop();
     assert!(all(&start()).is_empty());
+    // Of a later version, perhaps: kept, told, and mended over REST; the others work.
+    let kept = |name: &str, kind: &str| {
+        json!({"anywhere": true, "webhook": {"name": name, "url": format!("http://{address}/hooks/T0KEN"),
+               "types": [kind]}})
+    };
+    let both = json!({"webhooks": [kept("later", "line.vanished"), kept("works", "line.crossed")]});
+    std::fs::write(&file, both.to_string()).unwrap();
+    let service = start();
+    assert_eq!(all(&service), [pair("later", "api"), pair("works", "api")]);
+    assert_eq!((trial(&service, "later"), trial(&service, "works")), (json!(false), json!(true)));
+    let later = service.get("/v1/webhooks/later").json();
+    let error = later["last_error"].as_str().unwrap();
+    assert!(error.contains("cannot be used any more") && error.contains("line.vanished"), "{later}");
+    assert_eq!((&later["types"], &later["timeout_s"]), (&json!(["line.vanished"]), &json!(10.0)));
+    assert_eq!(service.metrics().get("gakp_webhook_up{webhook=\"later\"}"), 0.0);
+    assert_eq!(service.request("POST", "/v1/reload", None).json()["webhooks"], json!([]));
+    let patch = service.request("PATCH", "/v1/webhooks/later", Some(r#"{"types": ["line.crossed"]}"#));
+    assert_eq!(patch.json()["last_error"], Value::Null, "{patch:?}");
+    assert_eq!(trial(&service, "later"), true);
+    assert_eq!(all(&service), [pair("later", "api"), pair("works", "api")]);
+    let log = service.stop();
+    assert!(log.contains("line.vanished") && !log.contains("T0KEN"), "{log}");
+    assert!(!std::fs::read_to_string(&file).unwrap().contains("vanished"));
     // Damaged: said, and left as it is.
     std::fs::write(&file, "{\"webhooks\": [").unwrap();
     let output = run_to_end(&["serve", "--state-dir", state.to_str().unwrap()], &[]);

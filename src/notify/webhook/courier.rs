@@ -1,12 +1,12 @@
 //! A webhook's way: events collected into its queue, posted in order, tried again while it makes sense.
 
+use std::future::pending;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::http::header::InvalidHeaderValue;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use bytes::Bytes;
-use futures::FutureExt;
 use jiff::Timestamp;
 use tokio::sync::watch;
 use tokio::time::{sleep, sleep_until, timeout};
@@ -16,7 +16,7 @@ use crate::notify::cloud_event::{MEDIA_TYPE, body, signature, trial};
 use crate::notify::config::WebhookPlan;
 use crate::notify::queue::Waiting;
 use crate::notify::{GRACE, Stop};
-use crate::outgoing::{Poster, backoff};
+use crate::outgoing::{Address, Poster, backoff};
 use crate::publish::{EventListener, Heard};
 
 /// Longest wait between two attempts that the receiver did not ask for.
@@ -32,6 +32,14 @@ async fn removed(mut plans: Plans) {
     while plans.changed().await.is_ok() {}
 }
 
+/// Resolves once posts go elsewhere. Cancel safe.
+async fn elsewhere(mut plans: Plans, here: &Address) {
+    if plans.wait_for(|plan| plan.address != *here).await.is_err() {
+        // It is removed, which is noticed in another place.
+        pending().await
+    }
+}
+
 /// Takes what the hub tells into the queue.
 pub(super) async fn collect(
     account: Arc<Account>,
@@ -44,10 +52,7 @@ pub(super) async fn collect(
         let heard = tokio::select! {
             heard = listener.next() => heard,
             // What was told before the end still counts.
-            () = stop.stopped() => match listener.next().now_or_never() {
-                Some(heard) => heard,
-                None => break,
-            },
+            () = stop.stopped() => listener.try_next(),
             () = &mut removed => break,
         };
         match heard {
@@ -109,7 +114,12 @@ impl Worker {
             self.take_up();
             let message = body(&event).map_err(MessageError::from);
             let attempt = match message.and_then(|body| Message::new(&event.id, body, &self.plan)) {
-                Ok(message) => attempt(&mut self.poster, message, self.plan.timeout).await,
+                Ok(message) => tokio::select! {
+                    biased;
+                    attempt = attempt(&mut self.poster, message, self.plan.timeout) => attempt,
+                    // Where it goes now it is posted at once.
+                    () = elsewhere(self.plans.clone(), &self.plan.address) => continue,
+                },
                 Err(error) => Attempt::Refused(error.to_string()),
             };
             let wait = match attempt {

@@ -3,18 +3,19 @@
 mod account;
 mod courier;
 mod spec;
+mod status;
 
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use prometheus::Registry;
-use serde::Serialize;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 pub(crate) use spec::Kept;
 pub use spec::{WebhookPatch, WebhookSpec};
+pub use status::{WebhookSettings, WebhookSource, WebhookStatus, WebhookTrial};
 
 use super::Stop;
 use super::config::WebhookPlan;
@@ -25,62 +26,6 @@ use spec::WebhookFile;
 
 /// Most webhooks while one is added at run time.
 const MAX_WEBHOOKS: usize = 32;
-
-/// Who said that there is a webhook.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum WebhookSource {
-    /// The configuration: changed there, and read again.
-    Configuration,
-    /// The API.
-    Api,
-}
-
-/// A webhook and how it fares.
-#[derive(Clone, Debug, Serialize)]
-pub struct WebhookStatus {
-    /// Its name.
-    pub name: String,
-    /// Who said that there is one.
-    pub source: WebhookSource,
-    /// Where it posts to: scheme, host and port.
-    pub url: String,
-    /// Whether posts are signed.
-    pub signed: bool,
-    /// Only events of these cameras; of all where there are none.
-    pub cameras: Vec<String>,
-    /// Only events of these types; of all where there are none.
-    pub types: Vec<&'static str>,
-    /// How long a post may take, seconds.
-    pub timeout_s: f64,
-    /// How long an event is tried, seconds.
-    pub give_up_after_s: f64,
-    /// Most events that wait.
-    pub queue: usize,
-    /// Events that were delivered.
-    pub delivered: u64,
-    /// Events that were lost, for whatever reason.
-    pub failed: u64,
-    /// Events that wait.
-    pub pending: usize,
-    /// What last went wrong; stays after recovery.
-    pub last_error: Option<String>,
-    /// When that was, RFC 3339.
-    pub last_error_time: Option<String>,
-}
-
-/// What came of a post that only tried whether the receiver takes posts.
-#[derive(Clone, Debug, Serialize)]
-pub struct WebhookTrial {
-    /// Whether it was answered with 2xx.
-    pub delivered: bool,
-    /// Its answer's status, where it was delivered.
-    pub status: Option<u16>,
-    /// What went wrong.
-    pub error: Option<String>,
-    /// How long it took, milliseconds.
-    pub took_ms: f64,
-}
 
 /// Why a webhook cannot be added, changed, removed.
 #[derive(Debug, thiserror::Error)]
@@ -116,22 +61,22 @@ pub enum WebhookError {
 #[derive(Debug, Default)]
 pub struct RememberedWebhooks {
     file: Option<WebhookFile>,
-    kept: Vec<(Kept, WebhookPlan)>,
+    /// Each, and what it comes to or why it cannot be used any more.
+    kept: Vec<(Kept, Result<WebhookPlan, String>)>,
 }
 
 impl RememberedWebhooks {
-    /// What the state folder remembers.
+    /// What the state folder remembers. One that cannot be used any more stays among them.
     ///
     /// # Errors
-    /// The file cannot be read, is damaged, or what it holds cannot be used any more.
+    /// The file cannot be read or is damaged.
     pub fn read(folder: &Path) -> Result<Self, WebhookError> {
         let (file, kept) = WebhookFile::open(folder).map_err(WebhookError::Io)?;
-        let planned = kept.into_iter().map(|kept| {
-            let name = kept.webhook.name.clone();
-            let plan = kept.plan().map_err(|what| WebhookError::Invalid { name, what })?;
-            Ok((kept, plan))
+        let kept = kept.into_iter().map(|kept| {
+            let plan = kept.plan();
+            (kept, plan)
         });
-        Ok(Self { file: Some(file), kept: planned.collect::<Result<_, WebhookError>>()? })
+        Ok(Self { file: Some(file), kept: kept.collect() })
     }
 
     /// Whether one of them has this name.
@@ -139,9 +84,9 @@ impl RememberedWebhooks {
         self.kept.iter().any(|(kept, _)| kept.webhook.name == name)
     }
 
-    /// Those of them, checked.
-    pub(super) fn plans(&self) -> impl Iterator<Item = &WebhookPlan> {
-        self.kept.iter().map(|(_, plan)| plan)
+    /// Each one's name, and what it comes to or why it cannot be used any more.
+    pub(super) fn plans(&self) -> impl Iterator<Item = (&str, Result<&WebhookPlan, &str>)> {
+        self.kept.iter().map(|(kept, plan)| (&*kept.webhook.name, plan.as_ref().map_err(String::as_str)))
     }
 }
 
@@ -167,27 +112,30 @@ struct Set {
 
 struct Hook {
     account: Arc<Account>,
-    /// What it goes by; its tasks end when this is dropped.
-    plan: watch::Sender<Arc<WebhookPlan>>,
+    work: Work,
     /// What is remembered of it; `None` for one of the configuration.
     kept: Option<Kept>,
 }
 
+enum Work {
+    /// What it goes by; its tasks end when this is dropped.
+    Runs(watch::Sender<Arc<WebhookPlan>>),
+    /// It is remembered and cannot be used any more.
+    Idle { settings: WebhookSettings, why: String },
+}
+
 impl Hook {
     fn status(&self) -> WebhookStatus {
-        let (account, plan) = (&*self.account, self.plan.borrow());
+        let account = &*self.account;
         let (delivered, failed) = account.totals();
         let last_error = account.last_error();
         WebhookStatus {
             name: account.name.clone(),
             source: if self.kept.is_some() { WebhookSource::Api } else { WebhookSource::Configuration },
-            url: plan.address.to_string(),
-            signed: plan.key.is_some(),
-            cameras: plan.filter.cameras.iter().map(ToString::to_string).collect(),
-            types: plan.filter.kinds.iter().copied().collect(),
-            timeout_s: plan.timeout.as_secs_f64(),
-            give_up_after_s: plan.give_up.as_secs_f64(),
-            queue: plan.queue,
+            settings: match &self.work {
+                Work::Runs(plan) => WebhookSettings::from(&**plan.borrow()),
+                Work::Idle { settings, .. } => settings.clone(),
+            },
             delivered,
             failed,
             pending: account.queue.len(),
@@ -196,10 +144,11 @@ impl Hook {
         }
     }
 
-    fn change(&self, plan: WebhookPlan) {
-        let dropped = self.account.queue.resize(plan.queue);
-        self.account.count(Outcome::Dropped, dropped);
-        self.plan.send_replace(Arc::new(plan));
+    fn plan(&self) -> Option<Arc<WebhookPlan>> {
+        match &self.work {
+            Work::Runs(plan) => Some(plan.borrow().clone()),
+            Work::Idle { .. } => None,
+        }
     }
 }
 
@@ -208,7 +157,7 @@ impl Shared {
         self.set.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Starts a webhook: a task to collect its events and one to deliver them.
+    /// Starts a webhook, in the place of one of its name: a task to collect its events and one to deliver them.
     fn open(&self, set: &mut Set, plan: WebhookPlan, kept: Option<Kept>) {
         // Those that have ended.
         while set.tasks.try_join_next().is_some() {}
@@ -219,7 +168,27 @@ impl Shared {
         let listener = self.events.listen(EventFilter::default());
         set.tasks.spawn(courier::collect(account.clone(), listener, plans.clone(), self.stop.clone()));
         set.tasks.spawn(courier::deliver(account.clone(), plans, self.stop.clone()));
-        set.hooks.push(Hook { account, plan, kept });
+        set.put(Hook { account, work: Work::Runs(plan), kept });
+    }
+
+    /// Keeps a webhook that cannot be used any more, until it is changed, removed, or can be used again.
+    fn shelve(&self, set: &mut Set, kept: Kept, why: String) {
+        let settings = WebhookSettings::from(&kept.webhook);
+        let account = Arc::new(Account::open(&kept.webhook.name, settings.queue, &self.figures));
+        account.failed(format!("it cannot be used any more, and is told nothing: {why}"));
+        set.put(Hook { account, work: Work::Idle { settings, why }, kept: Some(kept) });
+    }
+
+    /// Has a webhook go by another plan. What waits stays.
+    fn change(&self, set: &mut Set, plan: WebhookPlan, kept: Option<Kept>) {
+        let hook = set.hooks.iter_mut().find(|hook| hook.account.name == plan.name);
+        let Some(Hook { account, work: Work::Runs(current), kept: before }) = hook else {
+            return self.open(set, plan, kept);
+        };
+        let dropped = account.queue.resize(plan.queue);
+        account.count(Outcome::Dropped, dropped);
+        current.send_replace(Arc::new(plan));
+        *before = kept;
     }
 
     /// Ends a webhook. What waits for it is lost, and counted as long as anybody can see it.
@@ -238,14 +207,27 @@ impl Shared {
 }
 
 impl Set {
+    /// Adds it, or puts it in the place of one of its name.
+    fn put(&mut self, hook: Hook) {
+        match self.hooks.iter_mut().find(|other| other.account.name == hook.account.name) {
+            Some(place) => *place = hook,
+            None => self.hooks.push(hook),
+        }
+    }
+
     fn find(&self, name: &str) -> Option<&Hook> {
         self.hooks.iter().find(|hook| hook.account.name == name)
     }
 
-    /// What is to be remembered, and of one webhook something else.
-    fn kept_but(&self, name: &str, other: Option<Kept>) -> Vec<Kept> {
-        let kept = self.hooks.iter().filter_map(|hook| hook.kept.clone());
-        kept.filter(|kept| kept.webhook.name != name).chain(other).collect()
+    /// Those that cannot be used any more.
+    fn shelved(&self) -> Vec<Kept> {
+        let idle = self.hooks.iter().filter(|hook| matches!(hook.work, Work::Idle { .. }));
+        idle.filter_map(|hook| hook.kept.clone()).collect()
+    }
+
+    /// What is to be remembered.
+    fn kept(&self) -> Vec<Kept> {
+        self.hooks.iter().filter_map(|hook| hook.kept.clone()).collect()
     }
 }
 
@@ -270,7 +252,10 @@ impl Webhooks {
             shared.open(&mut set, plan, None);
         }
         for (kept, plan) in kept {
-            shared.open(&mut set, plan, Some(kept));
+            match plan {
+                Ok(plan) => shared.open(&mut set, plan, Some(kept)),
+                Err(why) => shared.shelve(&mut set, kept, why),
+            }
         }
         drop(set);
         Ok(Self(Arc::new(shared)))
@@ -310,7 +295,7 @@ impl Webhooks {
             if set.hooks.len() >= MAX_WEBHOOKS {
                 return Err(WebhookError::LimitReached(MAX_WEBHOOKS));
             }
-            set.kept_but(&name, Some(kept.clone()))
+            set.kept().into_iter().chain([kept.clone()]).collect()
         };
         shared.save(all).await?;
         shared.open(&mut shared.set(), plan, Some(kept));
@@ -334,21 +319,12 @@ impl Webhooks {
         let anywhere = if patch.url.is_some() { reach == Reach::Anywhere } else { before.anywhere };
         let kept = Kept { anywhere, webhook: patch.apply(&before.webhook) };
         let plan = kept.plan().map_err(|what| WebhookError::Invalid { name: name.to_owned(), what })?;
-        let all = {
-            let set = shared.set();
-            let mut all = set.kept_but("", None);
-            for other in all.iter_mut().filter(|other| other.webhook.name == name) {
-                *other = kept.clone();
-            }
-            all
-        };
-        shared.save(all).await?;
-        let mut set = shared.set();
-        if let Some(hook) = set.hooks.iter_mut().find(|hook| hook.account.name == name) {
-            hook.kept = Some(kept);
-            hook.change(plan);
+        let mut all = shared.set().kept();
+        for other in all.iter_mut().filter(|other| other.webhook.name == name) {
+            *other = kept.clone();
         }
-        drop(set);
+        shared.save(all).await?;
+        shared.change(&mut shared.set(), plan, Some(kept));
         self.get(name)
     }
 
@@ -360,7 +336,8 @@ impl Webhooks {
         let shared = &*self.0;
         let _one = shared.changes.lock().await;
         self.added(name)?;
-        let all = shared.set().kept_but(name, None);
+        let mut all = shared.set().kept();
+        all.retain(|kept| kept.webhook.name != name);
         shared.save(all).await?;
         shared.close(&mut shared.set(), name);
         Ok(())
@@ -380,10 +357,16 @@ impl Webhooks {
         let plan = {
             let set = self.0.set();
             let hook = set.find(name).ok_or_else(|| WebhookError::Unknown(name.to_owned()))?;
-            hook.plan.borrow().clone()
+            match &hook.work {
+                Work::Runs(plan) => Ok(plan.borrow().clone()),
+                Work::Idle { why, .. } => Err(why.clone()),
+            }
         };
         let begun = Instant::now();
-        let posted = courier::try_once(&plan).await;
+        let posted = match plan {
+            Ok(plan) => courier::try_once(&plan).await,
+            Err(why) => Err(why),
+        };
         let took_ms = (begun.elapsed().as_secs_f64() * 1e5).round() / 100.0;
         let (status, error) = match posted {
             Ok(status) => (Some(status.as_u16()), None),
@@ -392,8 +375,8 @@ impl Webhooks {
         Ok(WebhookTrial { delivered: status.is_some(), status, error, took_ms })
     }
 
-    /// Takes over what the configuration has now; the names of those that were started, changed or removed, and what
-    /// could not be done.
+    /// Takes over what the configuration has now, and tries those again that could not be used; the names of those that
+    /// were started, changed or removed, and what could not be done.
     pub async fn configure(&self, plans: Vec<WebhookPlan>) -> (Vec<String>, Vec<String>) {
         let shared = &*self.0;
         let _one = shared.changes.lock().await;
@@ -417,15 +400,26 @@ impl Webhooks {
                         "webhook {name}: one of this name was added at run time; delete that one first"
                     ));
                 }
-                Some(hook) if hook.plan.borrow().is_like(&plan) => {}
-                Some(hook) => {
-                    hook.change(plan);
-                    changed.push(name);
-                }
-                None => {
+                Some(hook) if hook.plan().is_some_and(|before| before.is_like(&plan)) => {}
+                // Its name is its place, where another stands now: what waits was for the one before.
+                Some(hook)
+                    if !plan.named && hook.plan().is_some_and(|before| before.address != plan.address) =>
+                {
+                    shared.close(&mut set, &name);
                     shared.open(&mut set, plan, None);
                     changed.push(name);
                 }
+                _ => {
+                    shared.change(&mut set, plan, None);
+                    changed.push(name);
+                }
+            }
+        }
+        // Perhaps what was missing is there by now.
+        for kept in set.shelved() {
+            if let Ok(plan) = kept.plan() {
+                changed.push(plan.name.clone());
+                shared.open(&mut set, plan, Some(kept));
             }
         }
         (changed, failed)

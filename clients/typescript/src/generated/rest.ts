@@ -1477,9 +1477,9 @@ export interface components {
             /** @description Whether posts are signed. */
             signed: boolean;
             /** @description Only events of these cameras; of all where there are none. */
-            cameras: components["schemas"]["Name"][];
-            /** @description Only events of these types; of all where there are none. */
-            types: components["schemas"]["EventType"][];
+            cameras: string[];
+            /** @description Only events of these types, as they were asked for; of all where there are none. */
+            types: string[];
             /** @description How long a post may take. */
             timeout_s: number;
             /** @description How long an event is tried. */
@@ -1488,7 +1488,7 @@ export interface components {
             queue: number;
             /** @description Events that were delivered. */
             delivered: number;
-            /** @description Events that were refused, dropped or given up. */
+            /** @description Events that were refused, given up, dropped or pending at the end; and all that came too fast to be read, wanted or not. */
             failed: number;
             /** @description Events that wait. */
             pending: number;
