@@ -5,7 +5,7 @@
 //! and receivers are, so those are allowed.
 
 use std::io;
-use std::net::{IpAddr, Ipv6Addr, SocketAddr, UdpSocket};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 
 /// How far a connection may go.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -36,9 +36,21 @@ impl Reach {
     }
 }
 
-/// Whether an interface of this machine has the address: only such a one can be bound. Nothing is sent.
+/// Whether an interface of this machine has the address: only such a one is reached from itself.
 fn is_own(address: IpAddr) -> bool {
-    UdpSocket::bind((address, 0)).is_ok()
+    source_to(address).is_ok_and(|source| source == address)
+}
+
+/// The address of this machine from which another is reached, as the routes say it. Nothing is sent.
+fn source_to(address: IpAddr) -> io::Result<IpAddr> {
+    let any = match address {
+        IpAddr::V4(_) => IpAddr::from(Ipv4Addr::UNSPECIFIED),
+        IpAddr::V6(_) => IpAddr::from(Ipv6Addr::UNSPECIFIED),
+    };
+    let socket = UdpSocket::bind((any, 0))?;
+    // Any port but 0 does.
+    socket.connect((address, 9))?;
+    Ok(socket.local_addr()?.ip())
 }
 
 /// Whether an address is of a kind that does not leave this machine, is link-local, or is no host's at all.
@@ -78,22 +90,18 @@ fn embedded(v6: Ipv6Addr) -> Option<IpAddr> {
 mod tests {
     use super::*;
 
-    /// The address that the machine has on its network, as the routes say it. There may be none.
-    fn own_address() -> Option<IpAddr> {
-        let socket = UdpSocket::bind(("0.0.0.0", 0)).ok()?;
-        socket.connect(("198.51.100.1", 9)).ok()?;
-        socket.local_addr().ok().map(|address| address.ip())
-    }
-
     #[tokio::test]
     async fn this_machines_address_on_the_network_is_its_own() {
-        assert!(is_own(IpAddr::from([127, 0, 0, 1])) && !is_own(IpAddr::from([198, 51, 100, 1])));
-        let Some(own) = own_address() else {
+        let elsewhere = IpAddr::from([198, 51, 100, 1]);
+        assert!(is_own(Ipv4Addr::LOCALHOST.into()) && !is_own(elsewhere));
+        let Ok(own) = source_to(elsewhere) else {
             eprintln!("SKIPPED: the machine is on no network");
             return;
         };
-        let refused = Reach::Network.resolve(&own.to_string(), 80).await.unwrap_err();
-        assert_eq!(refused.kind(), io::ErrorKind::PermissionDenied, "{own}");
+        for own in [own.to_string(), format!("[::ffff:{own}]")] {
+            let refused = Reach::Network.resolve(&own, 80).await.unwrap_err();
+            assert_eq!(refused.kind(), io::ErrorKind::PermissionDenied, "{own}");
+        }
     }
 
     #[tokio::test]
