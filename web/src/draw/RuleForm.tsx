@@ -1,6 +1,7 @@
 import { useSignal } from "@preact/signals";
 import { words } from "../api";
 import { FormEnd } from "../ui/FormEnd";
+import { NameField } from "../ui/NameField";
 import { leastPoints, remove, save, type Draft } from "./rules";
 
 /** What is being drawn, beside the picture: what to do next, its name and settings, save or not. */
@@ -67,18 +68,7 @@ export function RuleForm(props: {
     >
       <h2>{draft.was ? `Change ${draft.was}` : `New ${what}`}</h2>
       <p class="quiet">Drag the points on the picture; pull a small one to add another.</p>
-      <label>
-        Name
-        <input
-          name="name"
-          required
-          maxLength={64}
-          pattern="[A-Za-z0-9][A-Za-z0-9._\-]*"
-          title="Letters, digits, dot, underscore, hyphen; begins with a letter or digit"
-          value={draft.name}
-          onInput={(event) => change({ ...draft, name: event.currentTarget.value })}
-        />
-      </label>
+      <NameField value={draft.name} set={(name) => change({ ...draft, name })} />
       {what === "line" ? (
         <button type="button" onClick={() => change({ ...draft, points: draft.points.toReversed() })}>
           Swap in and out

@@ -1,4 +1,5 @@
 import type { Signal } from "@preact/signals";
+import { NameField } from "../ui/NameField";
 
 /** What the form for a camera holds. */
 export interface Fields {
@@ -14,23 +15,7 @@ export function CameraFields(props: { fields: Signal<Fields>; current?: string }
   const set = (change: Partial<Fields>) => (fields.value = { ...fields.value, ...change });
   return (
     <>
-      {current === undefined && (
-        <label>
-          Name
-          <input
-            name="id"
-            required
-            autofocus
-            maxLength={64}
-            pattern="[A-Za-z0-9][A-Za-z0-9._\-]*"
-            title="Letters, digits, dot, underscore, hyphen; begins with a letter or digit"
-            placeholder="gate"
-            autocomplete="off"
-            value={fields.value.id}
-            onInput={(event) => set({ id: event.currentTarget.value })}
-          />
-        </label>
-      )}
+      {current === undefined && <NameField name="id" value={fields.value.id} set={(id) => set({ id })} first placeholder="gate" />}
       <label>
         {current === undefined ? "Address" : "New address (empty: stays as it is)"}
         <input

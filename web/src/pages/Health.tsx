@@ -4,6 +4,7 @@ import { ApiError, ask, askText, words } from "../api";
 import { bytes, moment, number, span, stateWords } from "../format";
 import { cameraHref } from "../route";
 import { awake, cameras } from "../state";
+import { Table } from "../ui/Table";
 import { parse, quantile, rate, sum, type Metrics } from "./metrics";
 
 const LOOK_MS = 2000;
@@ -126,67 +127,41 @@ export function Health() {
         <h2 id="cameras">Cameras</h2>
         {all.length === 0 && <p class="quiet">No camera yet.</p>}
         {all.length > 0 && (
-          <div class="wide">
-            <table class="list">
-              <thead>
-                <tr>
-                  {["Camera", "State", "Since", "Pictures", "95 % within", "Left out", "Reconnects", "Last trouble"].map((name) => (
-                    <th scope="col" key={name}>
-                      {name}
-                    </th>
-                  ))}
+          <Table heads={["Camera", "State", "Since", "Pictures", "95 % within", "Left out", "Reconnects", "Last trouble"]}>
+            {all.map((camera) => {
+              const labels = { camera: camera.id };
+              return (
+                <tr key={camera.id} data-state={camera.state}>
+                  <th scope="row">
+                    <a href={cameraHref(camera.id)}>{camera.id}</a>
+                  </th>
+                  <td data-label="State" class="state">
+                    {stateWords(camera)}
+                  </td>
+                  <td data-label="Since">{moment(camera.since)}</td>
+                  <td data-label="Pictures">{perSecond(rate(m, b, s, "gakp_frames_tracked_total", labels))}</td>
+                  <td data-label="95 % within">{ms(quantile(m, b, "gakp_decode_to_publish_seconds", 0.95, labels))}</td>
+                  <td data-label="Left out">{number(Object.values(camera.dropped).reduce((sum, n) => sum + n, 0))}</td>
+                  <td data-label="Reconnects">{number(camera.reconnects)}</td>
+                  <td data-label="Last trouble">{camera.last_error ?? "none"}</td>
                 </tr>
-              </thead>
-              <tbody>
-                {all.map((camera) => {
-                  const labels = { camera: camera.id };
-                  return (
-                    <tr key={camera.id} data-state={camera.state}>
-                      <th scope="row">
-                        <a href={cameraHref(camera.id)}>{camera.id}</a>
-                      </th>
-                      <td data-label="State" class="state">
-                        {stateWords(camera)}
-                      </td>
-                      <td data-label="Since">{moment(camera.since)}</td>
-                      <td data-label="Pictures">{perSecond(rate(m, b, s, "gakp_frames_tracked_total", labels))}</td>
-                      <td data-label="95 % within">{ms(quantile(m, b, "gakp_decode_to_publish_seconds", 0.95, labels))}</td>
-                      <td data-label="Left out">{number(Object.values(camera.dropped).reduce((sum, n) => sum + n, 0))}</td>
-                      <td data-label="Reconnects">{number(camera.reconnects)}</td>
-                      <td data-label="Last trouble">{camera.last_error ?? "none"}</td>
-                    </tr>
-                  );
-                })}
-              </tbody>
-            </table>
-          </div>
+              );
+            })}
+          </Table>
         )}
       </section>
       <section class="panel" aria-labelledby="models">
         <h2 id="models">Networks</h2>
-        <div class="wide">
-          <table class="list">
-            <thead>
-              <tr>
-                {["Network", "Runs", "Half within", "95 % within"].map((name) => (
-                  <th scope="col" key={name}>
-                    {name}
-                  </th>
-                ))}
-              </tr>
-            </thead>
-            <tbody>
-              {(m.get("gakp_model_run_seconds_count") ?? []).map(({ labels: { model = "" } }) => (
-                <tr key={model}>
-                  <th scope="row">{MODELS[model] ?? model}</th>
-                  <td data-label="Runs">{perSecond(rate(m, b, s, "gakp_model_run_seconds_count", { model }))}</td>
-                  <td data-label="Half within">{ms(quantile(m, b, "gakp_model_run_seconds", 0.5, { model }))}</td>
-                  <td data-label="95 % within">{ms(quantile(m, b, "gakp_model_run_seconds", 0.95, { model }))}</td>
-                </tr>
-              ))}
-            </tbody>
-          </table>
-        </div>
+        <Table heads={["Network", "Runs", "Half within", "95 % within"]}>
+          {(m.get("gakp_model_run_seconds_count") ?? []).map(({ labels: { model = "" } }) => (
+            <tr key={model}>
+              <th scope="row">{MODELS[model] ?? model}</th>
+              <td data-label="Runs">{perSecond(rate(m, b, s, "gakp_model_run_seconds_count", { model }))}</td>
+              <td data-label="Half within">{ms(quantile(m, b, "gakp_model_run_seconds", 0.5, { model }))}</td>
+              <td data-label="95 % within">{ms(quantile(m, b, "gakp_model_run_seconds", 0.95, { model }))}</td>
+            </tr>
+          ))}
+        </Table>
       </section>
     </>
   );

@@ -5,6 +5,7 @@ import { fetchRules, type Rules } from "../draw/rules";
 import { EVENT_TYPES, eventWords, moment, span } from "../format";
 import { cameraHref } from "../route";
 import { cameras, maySee } from "../state";
+import { Table } from "../ui/Table";
 import { PathDrawing } from "./PathDrawing";
 
 interface Search {
@@ -204,41 +205,28 @@ function Tracks({ tracks }: { tracks: PastTrack[] }) {
   if (!tracks.length) return <p class="quiet">Nobody was seen like that. Leave fields empty to search wider.</p>;
   const pictures = maySee.value && tracks.some((track) => track.snapshot);
   return (
-    <div class="wide">
-      <table class="list tracks">
-        <thead>
-          <tr>
-            {["Path", ...(pictures ? ["Picture"] : []), "Camera", "Who", "First seen", "Last seen", "For", "Sure"].map((name) => (
-              <th scope="col" key={name}>
-                {name}
-              </th>
-            ))}
-          </tr>
-        </thead>
-        <tbody>
-          {tracks.map((track) => (
-            <tr key={`${track.camera} ${track.epoch} ${track.id}`}>
-              <td>
-                <PathDrawing track={track} />
-              </td>
-              {pictures && (
-                <td>{track.snapshot && <img src={track.snapshot} alt={`${track.class} ${track.id}`} loading="lazy" />}</td>
-              )}
-              <td data-label="Camera">
-                <a href={cameraHref(track.camera)}>{track.camera}</a>
-              </td>
-              <td data-label="Who">
-                {track.class} {track.id}
-              </td>
-              <td data-label="First seen">{moment(track.first)}</td>
-              <td data-label="Last seen">{track.ended ? moment(track.last) : `${moment(track.last)}, not ended`}</td>
-              <td data-label="For">{span(track.seconds)}</td>
-              <td data-label="Sure">{Math.round(track.confidence * 100)} %</td>
-            </tr>
-          ))}
-        </tbody>
-      </table>
-    </div>
+    <Table heads={["Path", ...(pictures ? ["Picture"] : []), "Camera", "Who", "First seen", "Last seen", "For", "Sure"]} more="tracks">
+      {tracks.map((track) => (
+        <tr key={`${track.camera} ${track.epoch} ${track.id}`}>
+          <td>
+            <PathDrawing track={track} />
+          </td>
+          {pictures && (
+            <td>{track.snapshot && <img src={track.snapshot} alt={`${track.class} ${track.id}`} loading="lazy" />}</td>
+          )}
+          <td data-label="Camera">
+            <a href={cameraHref(track.camera)}>{track.camera}</a>
+          </td>
+          <td data-label="Who">
+            {track.class} {track.id}
+          </td>
+          <td data-label="First seen">{moment(track.first)}</td>
+          <td data-label="Last seen">{track.ended ? moment(track.last) : `${moment(track.last)}, not ended`}</td>
+          <td data-label="For">{span(track.seconds)}</td>
+          <td data-label="Sure">{Math.round(track.confidence * 100)} %</td>
+        </tr>
+      ))}
+    </Table>
   );
 }
 

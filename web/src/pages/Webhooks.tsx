@@ -6,6 +6,8 @@ import { awake, cameras } from "../state";
 import { Deletion } from "../ui/Deletion";
 import { Dialog } from "../ui/Dialog";
 import { FormEnd } from "../ui/FormEnd";
+import { NameField } from "../ui/NameField";
+import { Table } from "../ui/Table";
 
 const LOOK_MS = 3000;
 
@@ -56,52 +58,39 @@ export function Webhooks() {
       )}
       {hooks.value?.length === 0 && <p class="quiet">Nobody yet. A receiver is a web address to which each event is posted as it happens.</p>}
       {hooks.value && hooks.value.length > 0 && (
-        <div class="wide">
-          <table class="list">
-            <thead>
-              <tr>
-                {["Receiver", "Address", "Is told", "Delivered", "Waiting", "Lost", "Last trouble", "Try or delete"].map((name) => (
-                  <th scope="col" key={name}>
-                    {name}
-                  </th>
-                ))}
-              </tr>
-            </thead>
-            <tbody>
-              {hooks.value.map((hook) => (
-                <tr key={hook.name}>
-                  <th scope="row">{hook.name}</th>
-                  <td data-label="Address">
-                    {hook.url}
-                    {hook.signed && " (signed)"}
-                  </td>
-                  <td data-label="Is told">{wants(hook)}</td>
-                  <td data-label="Delivered">{number(hook.delivered)}</td>
-                  <td data-label="Waiting">{number(hook.pending)}</td>
-                  <td data-label="Lost">{number(hook.failed)}</td>
-                  <td data-label="Last trouble">
-                    {hook.last_error ? `${hook.last_error}, ${hook.last_error_time ? moment(hook.last_error_time) : ""}` : "none"}
-                  </td>
-                  <td data-label="Try or delete">
-                    <span class="row">
-                      <button type="button" aria-label={`Try ${hook.name}`} onClick={() => void attempt(hook.name)}>
-                        Try
-                      </button>
-                      {hook.source === "api" ? (
-                        <button type="button" class="danger" aria-label={`Delete ${hook.name}`} onClick={() => (deleting.value = hook.name)}>
-                          Delete
-                        </button>
-                      ) : (
-                        <span class="quiet">of the configuration</span>
-                      )}
-                    </span>
-                    <span role="status">{trials.value[hook.name]}</span>
-                  </td>
-                </tr>
-              ))}
-            </tbody>
-          </table>
-        </div>
+        <Table heads={["Receiver", "Address", "Is told", "Delivered", "Waiting", "Lost", "Last trouble", "Try or delete"]}>
+          {hooks.value.map((hook) => (
+            <tr key={hook.name}>
+              <th scope="row">{hook.name}</th>
+              <td data-label="Address">
+                {hook.url}
+                {hook.signed && " (signed)"}
+              </td>
+              <td data-label="Is told">{wants(hook)}</td>
+              <td data-label="Delivered">{number(hook.delivered)}</td>
+              <td data-label="Waiting">{number(hook.pending)}</td>
+              <td data-label="Lost">{number(hook.failed)}</td>
+              <td data-label="Last trouble">
+                {hook.last_error ? `${hook.last_error}, ${hook.last_error_time ? moment(hook.last_error_time) : ""}` : "none"}
+              </td>
+              <td data-label="Try or delete">
+                <span class="row">
+                  <button type="button" aria-label={`Try ${hook.name}`} onClick={() => void attempt(hook.name)}>
+                    Try
+                  </button>
+                  {hook.source === "api" ? (
+                    <button type="button" class="danger" aria-label={`Delete ${hook.name}`} onClick={() => (deleting.value = hook.name)}>
+                      Delete
+                    </button>
+                  ) : (
+                    <span class="quiet">of the configuration</span>
+                  )}
+                </span>
+                <span role="status">{trials.value[hook.name]}</span>
+              </td>
+            </tr>
+          ))}
+        </Table>
       )}
       {deleting.value !== null && (
         <Deletion
@@ -182,21 +171,7 @@ function AddWebhook({ close }: { close: () => void }) {
           void save();
         }}
       >
-        <label>
-          Name
-          <input
-            name="name"
-            required
-            autofocus
-            maxLength={64}
-            pattern="[A-Za-z0-9][A-Za-z0-9._\-]*"
-            title="Letters, digits, dot, underscore, hyphen; begins with a letter or digit"
-            placeholder="alarm"
-            autocomplete="off"
-            value={fields.value.name}
-            onInput={(event) => set({ name: event.currentTarget.value })}
-          />
-        </label>
+        <NameField value={fields.value.name} set={(name) => set({ name })} first placeholder="alarm" />
         <label>
           Address
           <input
