@@ -2,11 +2,13 @@
 
 use std::fs;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
 use gakp::api::RIGHTS;
 use gakp::auth::tls::Certificates;
 use gakp::auth::{Gate, Right, Role, TokenFile};
+use gakp::types::BBox;
 use serde_json::json;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
@@ -14,6 +16,7 @@ use tokio_rustls::TlsConnector;
 use tokio_rustls::rustls::pki_types::CertificateDer;
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::{ClientConfig, RootCertStore};
+use tokio_tungstenite::tungstenite::Message;
 
 use super::support::*;
 
@@ -42,6 +45,16 @@ impl Tokens {
 
     pub fn gate(&self) -> Gate {
         Gate::new(TokenFile::path(self.folder.path()), true).unwrap()
+    }
+
+    /// As `gakp token revoke` does for each of them.
+    fn revoke_all(&self) {
+        let path = TokenFile::path(self.folder.path());
+        let mut file = TokenFile::read(&path).unwrap();
+        for (name, _) in &self.all {
+            file.revoke(name).unwrap();
+        }
+        file.write(&path).unwrap();
     }
 
     pub fn bearer(&self, name: &str) -> String {
@@ -125,20 +138,63 @@ async fn a_token_is_asked_for_in_words_and_can_be_revoked() {
     let mut stream = server.socket("/v1/tracks", &[("authorization", value)]).await.unwrap();
 
     // Revoked in the file: noticed within seconds. The last token's end opens nothing.
-    let path = TokenFile::path(tokens.folder.path());
-    let mut file = TokenFile::read(&path).unwrap();
-    for (name, _) in &tokens.all {
-        file.revoke(name).unwrap();
-    }
-    file.write(&path).unwrap();
+    tokens.revoke_all();
+    known_to_be_revoked(&server, &viewer).await;
+    assert_eq!(stream.closed().await, 1008, "its streams end");
+    assert_eq!(server.get("/v1/cameras").await.status, 401);
+    server.stop().await;
+}
+
+/// Waits until the service has noticed.
+async fn known_to_be_revoked(server: &Server, bearer: &str) {
     patiently("the token to be gone", async {
-        while server.request("GET", "/v1/cameras", by_viewer, b"").await.status != 401 {
+        while server.request("GET", "/v1/cameras", &[("Authorization", bearer)], b"").await.status != 401 {
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
     })
     .await;
-    assert_eq!(stream.closed().await, 1008, "its streams end");
-    assert_eq!(server.get("/v1/cameras").await.status, 401);
+}
+
+/// Messages of a megabyte for clients that take five a second, with always more of them waiting: what is under way when
+/// the token ends is a message and what the kernel holds, not as many as a stream sends in a row.
+#[tokio::test]
+async fn a_slow_clients_stream_ends_with_its_token_as_well() {
+    let tokens = Tokens::new();
+    let server = Server::start_behind(tokens.gate(), None).await;
+    server.cameras.put("gate", "rtsp://host/gate");
+    let hub = server.hub.clone();
+    let publisher = tokio::spawn(async move {
+        let bbox = BBox::new(10.0, 20.0, 30.0, 60.0);
+        for seq in 0.. {
+            let mut report = tracks("gate", 1, seq, (320, 240), bbox);
+            report.tracks = vec![report.tracks[0]; 6000];
+            hub.publish(Arc::new(report));
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    });
+    let viewer = tokens.bearer("viewer");
+    let taken = AtomicU32::new(0);
+    let mut slow = vec![];
+    for _ in 0..4 {
+        let mut client = server.narrow_socket("/v1/tracks", &[("authorization", &viewer)]).await;
+        let taken = &taken;
+        slow.push(async move {
+            while !matches!(client.message().await, Message::Close(_)) {
+                taken.fetch_add(1, Ordering::Relaxed);
+                tokio::time::sleep(Duration::from_millis(200)).await;
+            }
+        });
+    }
+    let revoked = async {
+        eventually("a few messages", || taken.load(Ordering::Relaxed) >= 40).await;
+        tokens.revoke_all();
+        known_to_be_revoked(&server, &viewer).await;
+        taken.load(Ordering::Relaxed)
+    };
+    let (before, _) = tokio::join!(revoked, futures::future::join_all(slow));
+    let after = taken.load(Ordering::Relaxed) - before;
+    assert!(after <= 16, "{after} messages went out after the tokens' end");
+    publisher.abort();
     server.stop().await;
 }
 

@@ -310,11 +310,11 @@ impl Server {
     }
 
     /// A WebSocket whose client's kernel buffers little.
-    pub async fn narrow_socket(&self, path: &str) -> Socket {
+    pub async fn narrow_socket(&self, path: &str, headers: &[(&'static str, &str)]) -> Socket {
         let socket = TcpSocket::new_v4().unwrap();
         socket.set_recv_buffer_size(4096).unwrap();
         let stream = socket.connect(self.addr).await.unwrap();
-        self.socket_over(stream, path, &[]).await.unwrap()
+        self.socket_over(stream, path, headers).await.unwrap()
     }
 
     async fn socket_over(

@@ -179,7 +179,7 @@ async fn a_slow_client_is_told_what_it_missed() {
     let hub = HubConfig { capacity: 8, ..HubConfig::default() };
     let server = Server::start_with(hub, KeepAlive::default()).await;
     server.cameras.put("gate", "rtsp://host/gate");
-    let mut slow = server.narrow_socket("/v1/tracks").await;
+    let mut slow = server.narrow_socket("/v1/tracks", &[]).await;
     let mut quick = server.socket("/v1/tracks", &[]).await.ok().unwrap();
     for seq in 0..REPORTS {
         let mut report = Arc::unwrap_or_clone(report("gate", seq));
