@@ -5,7 +5,7 @@
 //! and receivers are, so those are allowed.
 
 use std::io;
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
+use std::net::{IpAddr, Ipv6Addr, SocketAddr, UdpSocket};
 
 /// How far a connection may go.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -36,20 +36,25 @@ impl Reach {
     }
 }
 
-/// Whether an interface of this machine has the address: only such a one is reached from itself.
+/// Whether an interface of this machine has the address. Nothing is sent.
 fn is_own(address: IpAddr) -> bool {
-    source_to(address).is_ok_and(|source| source == address)
+    match address {
+        // Bound may also be what is no own address (net.ipv4.ip_nonlocal_bind), but then no route begins there. The
+        // routes' own choice says less: for an interface's second address it is the first.
+        IpAddr::V4(_) => path(address, address).is_ok(),
+        IpAddr::V6(v6) => match embedded(v6) {
+            Some(v4) => is_own(v4),
+            // Here the routes choose the address itself, and a path from a foreign address may begin.
+            None => path(Ipv6Addr::UNSPECIFIED.into(), address).is_ok_and(|source| source == address),
+        },
+    }
 }
 
-/// The address of this machine from which another is reached, as the routes say it. Nothing is sent.
-fn source_to(address: IpAddr) -> io::Result<IpAddr> {
-    let any = match address {
-        IpAddr::V4(_) => IpAddr::from(Ipv4Addr::UNSPECIFIED),
-        IpAddr::V6(_) => IpAddr::from(Ipv6Addr::UNSPECIFIED),
-    };
-    let socket = UdpSocket::bind((any, 0))?;
+/// The address from which another is reached, where it may be any or is given.
+fn path(from: IpAddr, to: IpAddr) -> io::Result<IpAddr> {
+    let socket = UdpSocket::bind((from, 0))?;
     // Any port but 0 does.
-    socket.connect((address, 9))?;
+    socket.connect((to, 9))?;
     Ok(socket.local_addr()?.ip())
 }
 
@@ -88,17 +93,22 @@ fn embedded(v6: Ipv6Addr) -> Option<IpAddr> {
 
 #[cfg(test)]
 mod tests {
+    use std::net::Ipv4Addr;
+
     use super::*;
 
     #[tokio::test]
     async fn this_machines_address_on_the_network_is_its_own() {
         let elsewhere = IpAddr::from([198, 51, 100, 1]);
-        assert!(is_own(Ipv4Addr::LOCALHOST.into()) && !is_own(elsewhere));
-        let Ok(own) = source_to(elsewhere) else {
+        assert!(!is_own(elsewhere));
+        // Both are reached from the first, as an interface's second address is.
+        assert!(is_own([127, 0, 0, 1].into()) && is_own([127, 1, 2, 3].into()));
+        assert_eq!(path(Ipv4Addr::UNSPECIFIED.into(), [127, 1, 2, 3].into()).unwrap(), Ipv4Addr::LOCALHOST);
+        let Ok(own) = path(Ipv4Addr::UNSPECIFIED.into(), elsewhere) else {
             eprintln!("SKIPPED: the machine is on no network");
             return;
         };
-        for own in [own.to_string(), format!("[::ffff:{own}]")] {
+        for own in [own.to_string(), format!("[::ffff:{own}]"), format!("[64:ff9b::{own}]")] {
             let refused = Reach::Network.resolve(&own, 80).await.unwrap_err();
             assert_eq!(refused.kind(), io::ErrorKind::PermissionDenied, "{own}");
         }
