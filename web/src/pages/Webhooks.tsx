@@ -116,7 +116,7 @@ export function Webhooks() {
 }
 
 function wants(hook: Webhook): string {
-  const types = EVENT_TYPES.filter(([value]) => hook.types.includes(value)).map(([, name]) => name);
+  const types = hook.types.map((type) => EVENT_TYPES.find(([value]) => value === type)?.[1] ?? type);
   const what = types.length ? types.join(", ") : "everything";
   return hook.cameras.length ? `${what} at ${hook.cameras.join(", ")}` : what;
 }

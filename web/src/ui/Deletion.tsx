@@ -8,6 +8,8 @@ export function Deletion(props: { name: string; what: string; path: string; clos
   const { name, what, path, close, gone, children } = props;
   const error = useSignal("");
   const busy = useSignal(false);
+  // What is under way cannot be called off: its end is waited for.
+  const keep = () => !busy.value && close();
   const remove = async () => {
     busy.value = true;
     try {
@@ -20,7 +22,7 @@ export function Deletion(props: { name: string; what: string; path: string; clos
     }
   };
   return (
-    <Dialog title={`Delete ${name}?`} close={close}>
+    <Dialog title={`Delete ${name}?`} close={keep}>
       <p>{children}</p>
       <p role="alert" class="bad">
         {error.value}
@@ -29,7 +31,7 @@ export function Deletion(props: { name: string; what: string; path: string; clos
         <button type="button" class="danger" disabled={busy.value} onClick={() => void remove()}>
           Delete the {what}
         </button>
-        <button type="button" autofocus onClick={close}>
+        <button type="button" autofocus disabled={busy.value} onClick={keep}>
           Keep it
         </button>
       </div>
