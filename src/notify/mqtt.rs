@@ -531,8 +531,16 @@ impl Sink {
                 let _ = timeout_at(deadline, notice.wait_completion_async()).await;
             }
             let _ = session.client.try_disconnect();
-            while let Ok(Turn::Incoming(_) | Turn::Acknowledged) = timeout_at(deadline, session.turn()).await
-            {
+            loop {
+                match timeout_at(deadline, session.turn()).await {
+                    Ok(Turn::Incoming(_)) => {}
+                    // Late, but it was.
+                    Ok(Turn::Acknowledged) => {
+                        self.queue.pop_front();
+                        self.figures.count("event", "sent", 1);
+                    }
+                    Ok(Turn::Lost(_)) | Err(_) => break,
+                }
             }
         }
         self.figures.connected.set(0);
