@@ -226,6 +226,20 @@ async fn what_cannot_be_delivered_at_the_end_is_counted() {
     assert_eq!(running.outcome("webhook-1", "stopped"), 900);
 }
 
+/// The last attempt fails at once, while events are still being collected.
+#[tokio::test]
+async fn what_is_collected_after_the_last_attempt_is_counted_too() {
+    // Nothing listens there any more.
+    let gone = TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
+    let mut running = Running::start(&format!("[[webhook]]\nurl = \"http://{gone}/hooks/a\"")).await;
+    running.publish("gate", 1);
+    eventually("a failure", || running.status("webhook-1").last_error.is_some()).await;
+    running.publish("gate", 899);
+    running.notifier.stop().await;
+    assert_eq!((running.status("webhook-1").failed, running.status("webhook-1").pending), (900, 0));
+    assert_eq!(running.outcome("webhook-1", "stopped"), 900);
+}
+
 /// What waits for one is not sent to another that has its place, and so its name, in the file that is read again.
 #[tokio::test]
 async fn one_without_a_name_leaves_its_place_but_not_its_events() {

@@ -96,6 +96,13 @@ impl Queue {
         self.ready.notify_one();
     }
 
+    /// Resolves once nothing more comes. For whoever takes events out.
+    pub async fn closed(&self) {
+        while !self.lock().closed {
+            self.ready.notified().await;
+        }
+    }
+
     /// Takes all that is left; how many.
     pub fn clear(&self) -> u64 {
         let mut inner = self.lock();

@@ -72,7 +72,7 @@ impl Figures {
                 &["webhook"],
             )?,
             waiting: gauge("gakp_webhook_queue_length", "Events that wait to be posted.")?,
-            up: gauge("gakp_webhook_up", "1 unless the last post failed.")?,
+            up: gauge("gakp_webhook_up", "1 unless the last post failed or it cannot be used.")?,
         })
     }
 

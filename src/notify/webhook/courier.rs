@@ -143,6 +143,8 @@ impl Worker {
                 }
             };
             if self.stop.is_stopping() {
+                // What is still being collected is among what is left.
+                self.account.queue.closed().await;
                 return;
             }
             if self.take_up() {

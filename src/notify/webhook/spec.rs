@@ -1,5 +1,6 @@
 //! Webhooks that are added while the service runs: what is asked for, and the file that remembers it.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -9,6 +10,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 use crate::notify::config::{WebhookOptions, WebhookPlan};
 use crate::outgoing::{Reach, Secret, reveal, reveal_some};
 use crate::private;
+use crate::types::is_name;
 
 /// Most events that wait for a webhook that was added at run time.
 const MAX_QUEUE: usize = 10_000;
@@ -144,6 +146,23 @@ struct Contents {
     webhooks: Vec<Kept>,
 }
 
+impl Contents {
+    /// Each is known by its name, so that has to be one.
+    fn parse(text: &str) -> Result<Self, String> {
+        let contents: Self = serde_json::from_str(text).map_err(|error| error.to_string())?;
+        let mut names = BTreeSet::new();
+        for Kept { webhook: WebhookSpec { name, .. }, .. } in &contents.webhooks {
+            if !is_name(name) {
+                return Err(format!("the name {name:?} is not usable"));
+            }
+            if !names.insert(name) {
+                return Err(format!("the name {name:?} is there twice"));
+            }
+        }
+        Ok(contents)
+    }
+}
+
 impl WebhookFile {
     /// Reads what the folder remembers; one that is not there yet remembers nothing.
     ///
@@ -152,7 +171,7 @@ impl WebhookFile {
     pub fn open(folder: &Path) -> Result<(Self, Vec<Kept>), String> {
         let file = Self(folder.join("webhooks.json"));
         let contents: Contents = match fs::read_to_string(&file.0) {
-            Ok(text) => serde_json::from_str(&text).map_err(|reason| {
+            Ok(text) => Contents::parse(&text).map_err(|reason| {
                 let path = file.0.display();
                 format!(
                     "{path} is damaged ({reason}): mend it or move it away; the webhooks in it are lost otherwise"
@@ -193,10 +212,21 @@ mod tests {
         assert_eq!(WebhookFile::open(folder.path()).unwrap().1, kept);
         assert!(!format!("{kept:?}").contains("hunter2"));
         assert_eq!(kept[0].plan().unwrap().address.reach, Reach::Network);
-        let damaged = r#"{"webhooks": [{"anywhere": true, "webhook": {"name": "a", "url": 4711}}]}"#;
-        fs::write(folder.path().join("webhooks.json"), damaged).unwrap();
-        let error = WebhookFile::open(folder.path()).unwrap_err();
-        assert!(error.contains("damaged") && !error.contains("4711"), "{error}");
+        let hook = |name: &str, url: &str| {
+            format!(r#"{{"anywhere": true, "webhook": {{"name": "{name}", "url": {url}}}}}"#)
+        };
+        let twice = format!("{0}, {0}", hook("a", r#""http://u:hunter2@h""#));
+        for (webhooks, says) in [
+            (hook("a", "4711"), "must be a text"),
+            (hook("a/b", r#""http://h""#), "\"a/b\" is not usable"),
+            (twice, "\"a\" is there twice"),
+        ] {
+            fs::write(folder.path().join("webhooks.json"), format!(r#"{{"webhooks": [{webhooks}]}}"#))
+                .unwrap();
+            let error = WebhookFile::open(folder.path()).unwrap_err();
+            assert!(error.contains("damaged") && error.contains(says), "{error}");
+            assert!(!error.contains("4711") && !error.contains("hunter2"), "{error}");
+        }
     }
 
     #[test]

@@ -1443,7 +1443,7 @@ export interface components {
             queue?: number | null;
         };
         /**
-         * @description A webhook and how it fares, since the service started.
+         * @description A webhook and how it fares since it was started.
          * @example {
          *       "name": "alarm",
          *       "source": "api",
@@ -1472,7 +1472,7 @@ export interface components {
              * @enum {unknown}
              */
             source: "configuration" | "api";
-            /** @description Scheme, host and port; the rest may be secret. */
+            /** @description Scheme, host and port; the rest may be secret. Empty where it is remembered and no URL any more. */
             url: string;
             /** @description Whether posts are signed. */
             signed: boolean;
