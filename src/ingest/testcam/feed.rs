@@ -16,6 +16,10 @@ pub(super) struct Feeds(Mutex<All>);
 #[derive(Default)]
 struct All {
     frozen: bool,
+    /// Between two frames passes so many times as long as in the footage; 0 means 1.
+    slowed: u64,
+    /// Sent instead of a client's own.
+    instead: Option<Arc<Footage>>,
     feeds: Vec<Feed>,
 }
 
@@ -24,10 +28,12 @@ struct Feed {
     source: glib::WeakRef<gst_app::AppSrc>,
     footage: Arc<Footage>,
     looped: bool,
-    /// The next frame, counted through all rounds.
+    /// The next frame of the round.
     next: usize,
-    /// Added to every time: how long it was frozen.
-    delay: gst::ClockTime,
+    /// When that is decoded.
+    due: gst::ClockTime,
+    /// It comes from the footage that is sent instead.
+    away: bool,
     /// It asked for a frame while frozen.
     hungry: bool,
 }
@@ -44,8 +50,17 @@ impl Feeds {
         source.set_stream_type(gst_app::AppStreamType::Stream);
         let mut all = self.lock();
         all.feeds.retain(|feed| feed.source.upgrade().is_some());
-        let delay = gst::ClockTime::ZERO;
-        all.feeds.push(Feed { source: source.downgrade(), footage, looped, next: 0, delay, hungry: false });
+        let due = gst::ClockTime::ZERO;
+        let source_ref = source.downgrade();
+        all.feeds.push(Feed {
+            source: source_ref,
+            footage,
+            looped,
+            next: 0,
+            due,
+            away: false,
+            hungry: false,
+        });
         drop(all);
         let feeds = Arc::downgrade(self);
         source.set_callbacks(
@@ -61,66 +76,73 @@ impl Feeds {
 
     fn supply(&self, source: &gst_app::AppSrc) {
         let mut all = self.lock();
-        let frozen = all.frozen;
-        let Some(feed) = all.feeds.iter_mut().find(|feed| feed.source.upgrade().as_ref() == Some(source))
-        else {
+        let All { frozen, slowed, instead, feeds } = &mut *all;
+        let Some(feed) = feeds.iter_mut().find(|feed| feed.source.upgrade().as_ref() == Some(source)) else {
             return;
         };
-        if frozen {
+        if *frozen {
             feed.hungry = true;
         } else {
-            feed.push(source);
+            feed.push(source, *slowed, instead.as_deref());
         }
     }
 
+    /// Nothing is sent any more, or again.
     pub fn freeze(&self, frozen: bool) {
         let mut all = self.lock();
-        all.frozen = frozen;
+        let All { frozen: now, slowed, instead, feeds } = &mut *all;
+        *now = frozen;
         if frozen {
             return;
         }
-        for feed in &mut all.feeds {
+        for feed in feeds {
             if let (true, Some(source)) = (std::mem::take(&mut feed.hungry), feed.source.upgrade()) {
                 // Time went on: what was not sent is not made up for in a burst.
-                if let (Some(now), Some((_, due))) = (source.current_running_time(), feed.times()) {
-                    feed.delay += now.saturating_sub(due);
-                }
-                feed.push(&source);
+                feed.due = source.current_running_time().map_or(feed.due, |now| now.max(feed.due));
+                feed.push(&source, *slowed, instead.as_deref());
             }
         }
+    }
+
+    /// From one frame to the next it takes so many times as long.
+    pub fn slow(&self, times: u64) {
+        self.lock().slowed = times;
+    }
+
+    /// From the next key frame on, this is sent instead, or no longer.
+    pub fn replace(&self, footage: Option<Arc<Footage>>) {
+        self.lock().instead = footage;
     }
 }
 
 impl Feed {
-    /// When the next frame is shown and decoded; `None` at the end.
-    fn times(&self) -> Option<(gst::ClockTime, gst::ClockTime)> {
-        let count = self.footage.units.len();
-        let round = (self.next / count) as u64;
-        if round > 0 && !self.looped {
-            return None;
-        }
-        let unit = &self.footage.units[self.next % count];
-        let before = self.footage.round * round + self.delay;
-        Some((before + unit.pts, before + unit.dts))
-    }
-
     /// Hands over one frame. An error means that the client is leaving.
-    fn push(&mut self, source: &gst_app::AppSrc) {
-        let Some((pts, dts)) = self.times() else {
+    fn push(&mut self, source: &gst_app::AppSrc, slowed: u64, instead: Option<&Footage>) {
+        if self.away != instead.is_some() {
+            self.away = instead.is_some();
+            let footage = instead.unwrap_or(&self.footage);
+            self.next = footage.key_from(self.next);
+        }
+        let Footage { units, round, .. } = instead.unwrap_or(&self.footage);
+        let Some(unit) = units.get(self.next) else {
             let _ = source.end_of_stream();
             return;
         };
-        let unit = &self.footage.units[self.next % self.footage.units.len()];
         // The copy shares the bytes.
         let mut buffer = unit.data.copy();
         if let Some(buffer) = buffer.get_mut() {
-            buffer.set_pts(pts);
-            buffer.set_dts(dts);
+            buffer.set_pts(self.due + unit.pts.saturating_sub(unit.dts) * slowed.max(1));
+            buffer.set_dts(self.due);
             if !unit.key {
                 buffer.set_flags(gst::BufferFlags::DELTA_UNIT);
             }
         }
         self.next += 1;
+        let follows = units.get(self.next).map_or(*round, |unit| unit.dts);
+        self.due += follows.saturating_sub(unit.dts) * slowed.max(1);
+        if self.looped {
+            self.next %= units.len();
+        }
         let _ = source.push_buffer(buffer);
     }
 }

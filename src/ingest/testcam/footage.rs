@@ -23,6 +23,14 @@ pub(super) struct Footage {
     pub round: gst::ClockTime,
 }
 
+impl Footage {
+    /// The key frame from which frame `at` of the round, or one soon after, is decoded.
+    pub fn key_from(&self, at: usize) -> usize {
+        let later = self.units.iter().enumerate().skip(at).find(|(_, unit)| unit.key);
+        later.map_or(0, |(index, _)| index)
+    }
+}
+
 /// One encoded frame.
 pub(super) struct Unit {
     pub data: gst::Buffer,
@@ -31,9 +39,20 @@ pub(super) struct Unit {
     pub key: bool,
 }
 
-/// Reads a file. H.264 and H.265 are taken as they are unless `codec` asks for the other;
-/// anything else is transcoded. `fps` replaces the file's own times.
-pub(super) fn load(path: &Path, codec: Option<Codec>, fps: Option<f64>) -> Result<Footage, TestCameraError> {
+/// What to make of a file.
+#[derive(Clone, Copy)]
+pub(super) struct Form {
+    /// H.264 and H.265 are taken as they are unless this asks for the other; anything else is transcoded.
+    pub codec: Option<Codec>,
+    /// Instead of the file's own times.
+    pub fps: Option<f64>,
+    /// Half the width and height.
+    pub halved: bool,
+}
+
+/// Reads a file.
+pub(super) fn load(path: &Path, form: Form) -> Result<Footage, TestCameraError> {
+    let fps = form.fps;
     let shown = path.display().to_string();
     let failed = |what: String| TestCameraError::Video { path: shown.clone(), what };
     std::fs::File::open(path).map_err(|cause| TestCameraError::File { path: shown.clone(), cause })?;
@@ -54,7 +73,7 @@ pub(super) fn load(path: &Path, codec: Option<Codec>, fps: Option<f64>) -> Resul
         if end.sinks_are_linked() {
             return;
         }
-        if let Some(outcome) = plug(&pipeline, pad, end.upcast_ref(), codec).transpose() {
+        if let Some(outcome) = plug(&pipeline, pad, end.upcast_ref(), form).transpose() {
             // Full only if a file has more than 16 broken video streams.
             let _ = report.try_send(outcome);
         }
@@ -171,7 +190,7 @@ fn plug(
     pipeline: &gst::Pipeline,
     pad: &gst::Pad,
     sink: &gst::Element,
-    wanted: Option<Codec>,
+    form: Form,
 ) -> Result<Option<()>, TestCameraError> {
     let caps = pad.current_caps().unwrap_or_else(|| pad.query_caps(None));
     let Some(name) = caps.structure(0).map(|s| s.name().to_string()) else { return Ok(None) };
@@ -186,14 +205,17 @@ fn plug(
         }
         _ => None,
     };
-    let codec = wanted.or(native).unwrap_or(Codec::H264);
+    let codec = form.codec.or(native).unwrap_or(Codec::H264);
     let mut chain = Vec::new();
-    if native != Some(codec) {
+    if native != Some(codec) || form.halved {
         if name != "video/x-raw" {
             let failed = |e: crate::ingest::Failure| TestCameraError::Missing(e.to_string());
             chain.push(decoder::create(&caps, true, 2, &[]).map_err(failed)?);
         }
         chain.push(make("videoconvert")?);
+        if form.halved {
+            chain.extend([make("videoscale")?, halved(&caps)?]);
+        }
         chain.push(encoder(codec)?);
     }
     let parser = make(match codec {
@@ -222,6 +244,19 @@ fn plug(
     let entry = entry.ok_or_else(|| TestCameraError::Missing("an element without a sink pad".into()))?;
     pad.link(&entry).map_err(|e| TestCameraError::Missing(format!("GStreamer graph: {e}")))?;
     Ok(Some(()))
+}
+
+/// Lets only pictures of half the size through.
+fn halved(caps: &gst::Caps) -> Result<gst::Element, TestCameraError> {
+    let size = |name| caps.structure(0).and_then(|s| s.get::<i32>(name).ok()).filter(|size| *size >= 4);
+    let (Some(width), Some(height)) = (size("width"), size("height")) else {
+        return Err(TestCameraError::Missing(format!("a picture that can be halved: {caps}")));
+    };
+    let filter = make("capsfilter")?;
+    let caps =
+        gst::Caps::builder("video/x-raw").field("width", width / 4 * 2).field("height", height / 4 * 2);
+    filter.set_property("caps", caps.build());
+    Ok(filter)
 }
 
 /// Good pictures, no B frames, a key frame at least every 50 frames.

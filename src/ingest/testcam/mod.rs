@@ -2,10 +2,14 @@
 //!
 //! The file's encoded frames lie in memory; every client gets a media of its own, so that it sees the
 //! video from its first frame on. With UDP or TCP, with or without a password, with RTCP sender
-//! reports. [`TestCamera::kill_clients`] and [`TestCamera::freeze`] misbehave on purpose.
+//! reports. [`TestCamera::kill_clients`], [`TestCamera::freeze`] and [`TestCamera::inject`] misbehave on purpose.
 
+mod fault;
 mod feed;
 mod footage;
+mod gate;
+mod packets;
+mod wire;
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener};
 use std::path::PathBuf;
@@ -20,8 +24,11 @@ use gstreamer_rtsp_server::gio;
 use gstreamer_rtsp_server::prelude::*;
 use socket2::SockRef;
 
+pub use fault::Fault;
 use feed::Feeds;
-use footage::Footage;
+use footage::{Footage, Form};
+use gate::Gate;
+use packets::Packets;
 
 use super::Transport;
 
@@ -65,6 +72,8 @@ pub struct TestCameraConfig {
     pub looped: bool,
     /// What RTP may travel by; `Auto` is what the client asks for.
     pub transport: Transport,
+    /// Whether it may be told to go wrong ([`TestCamera::inject`]). What it sends takes one step more then.
+    pub faulty: bool,
 }
 
 impl TestCameraConfig {
@@ -79,6 +88,7 @@ impl TestCameraConfig {
             fps: None,
             looped: true,
             transport: Transport::Auto,
+            faulty: false,
         }
     }
 }
@@ -120,13 +130,15 @@ pub enum TestCameraError {
 
 /// A running test camera. Dropping it stops it.
 pub struct TestCamera {
+    config: TestCameraConfig,
     address: SocketAddr,
-    path: String,
-    user: Option<String>,
     frames: usize,
     codec: Codec,
+    gate: Option<Gate>,
     server: rtsp::RTSPServer,
+    factory: rtsp::RTSPMediaFactory,
     feeds: Arc<Feeds>,
+    packets: Arc<Packets>,
     context: glib::MainContext,
     main_loop: glib::MainLoop,
     thread: Option<JoinHandle<()>>,
@@ -148,7 +160,12 @@ impl TestCamera {
         // GStreamer does not say why it cannot listen; asked before the work of reading the file.
         let taken = |cause| TestCameraError::Listen { address: config.listen, cause };
         TcpListener::bind(config.listen).map_err(taken)?;
-        let footage = Arc::new(footage::load(&config.file, config.codec, config.fps)?);
+        let form = Form { codec: config.codec, fps: config.fps, halved: false };
+        let footage = Arc::new(footage::load(&config.file, form)?);
+        // Behind its gate the server is its own affair.
+        let local: IpAddr =
+            if config.listen.is_ipv4() { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() };
+        let inner = if config.faulty { (local, 0).into() } else { config.listen };
         let (frames, codec) = (footage.units.len(), footage.codec);
 
         let server = rtsp::RTSPServer::new();
@@ -157,10 +174,10 @@ impl TestCamera {
         let pool = rtsp::RTSPThreadPool::new();
         pool.set_max_threads(0);
         server.set_thread_pool(Some(&pool));
-        server.set_address(&config.listen.ip().to_string());
-        server.set_service(&config.listen.port().to_string());
-        let feeds = Arc::new(Feeds::default());
-        let factory = factory(footage, config.looped, feeds.clone());
+        server.set_address(&inner.ip().to_string());
+        server.set_service(&inner.port().to_string());
+        let (feeds, packets) = (Arc::new(Feeds::default()), Arc::new(Packets::default()));
+        let factory = factory(footage, config.looped, feeds.clone(), packets.clone());
         match config.transport {
             Transport::Auto => {}
             Transport::Tcp => factory.set_protocols(rtsp::gst_rtsp::RTSPLowerTrans::TCP),
@@ -171,7 +188,7 @@ impl TestCamera {
         }
         let mounts =
             server.mount_points().ok_or_else(|| TestCameraError::Missing("no mount points".into()))?;
-        mounts.add_factory(&config.path, factory);
+        mounts.add_factory(&config.path, factory.clone());
 
         let context = glib::MainContext::new();
         let main_loop = glib::MainLoop::new(Some(&context), false);
@@ -197,24 +214,34 @@ impl TestCamera {
         let thread = thread.map_err(taken)?;
         let gone = |_| Err(std::io::Error::other("the RTSP server does not start"));
         let port = listening.recv().unwrap_or_else(gone).map_err(taken)?;
-        Ok(Self {
-            address: (config.listen.ip(), port).into(),
-            path: config.path,
-            user: config.login.map(|(user, _)| user),
+        let mut camera = Self {
+            address: (inner.ip(), port).into(),
+            config,
             frames,
             codec,
+            gate: None,
             server,
+            factory,
             feeds,
+            packets,
             context,
             main_loop,
             thread: Some(thread),
-        })
+        };
+        if camera.config.faulty {
+            let listen = camera.config.listen;
+            let gate = Gate::open(listen, camera.address);
+            let gate = gate.map_err(|cause| TestCameraError::Listen { address: listen, cause })?;
+            camera.address = gate.address();
+            camera.gate = Some(gate);
+        }
+        Ok(camera)
     }
 
     /// The URL for clients, without the password (`user:***@` where one is needed).
     pub fn url(&self) -> String {
-        let login = self.user.as_ref().map(|user| format!("{user}:***@")).unwrap_or_default();
-        self.url_with(&login)
+        let login = self.config.login.as_ref().map(|(user, _)| format!("{user}:***@"));
+        self.url_with(&login.unwrap_or_default())
     }
 
     /// The URL with something (`user:password@`) before the host.
@@ -224,7 +251,7 @@ impl TestCamera {
             IpAddr::V6(ip) if ip.is_unspecified() => Ipv6Addr::LOCALHOST.into(),
             ip => ip,
         };
-        format!("rtsp://{login}{}{}", SocketAddr::from((ip, self.address.port())), self.path)
+        format!("rtsp://{login}{}{}", SocketAddr::from((ip, self.address.port())), self.config.path)
     }
 
     /// Where it listens.
@@ -255,6 +282,30 @@ impl TestCamera {
         });
     }
 
+    /// Goes wrong from now on in this way, and in no other; `None` lifts the fault. [`Fault::Resolution`] takes the
+    /// time of transcoding the video before it begins. Only a camera that was started `faulty` does it.
+    pub fn inject(&self, fault: Option<Fault>) -> Result<(), TestCameraError> {
+        let gate = self.gate.as_ref();
+        let gate =
+            gate.ok_or_else(|| TestCameraError::Setting("the camera was not started faulty".into()))?;
+        let halved = || {
+            let form = Form { codec: Some(self.codec), fps: self.config.fps, halved: true };
+            footage::load(&self.config.file, form).map(Arc::new)
+        };
+        let instead = (fault == Some(Fault::Resolution)).then(halved).transpose()?;
+        self.feeds.replace(instead);
+        self.feeds.slow(if fault == Some(Fault::FrameRate) { 2 } else { 1 });
+        self.feeds.freeze(matches!(fault, Some(Fault::Freeze | Fault::HalfOpen)));
+        self.packets.set(fault);
+        self.factory.set_enable_rtcp(fault != Some(Fault::NoSenderReports));
+        gate.set(fault);
+        if fault.is_some_and(Fault::cuts_off) {
+            // Over UDP the server goes on without the connection.
+            self.kill_clients();
+        }
+        Ok(())
+    }
+
     /// Cuts every client off and stops listening.
     pub fn stop(mut self) {
         self.shut_down();
@@ -262,6 +313,7 @@ impl TestCamera {
 
     fn shut_down(&mut self) {
         if let Some(thread) = self.thread.take() {
+            self.gate = None;
             self.kill_clients();
             let main_loop = self.main_loop.clone();
             self.in_server_thread(move || main_loop.quit());
@@ -318,7 +370,12 @@ fn listen(server: &rtsp::RTSPServer) -> std::io::Result<(glib::Source, u16)> {
 }
 
 /// Makes a media for every client: an appsrc, fed from memory, and a payloader.
-fn factory(footage: Arc<Footage>, looped: bool, feeds: Arc<Feeds>) -> rtsp::RTSPMediaFactory {
+fn factory(
+    footage: Arc<Footage>,
+    looped: bool,
+    feeds: Arc<Feeds>,
+    packets: Arc<Packets>,
+) -> rtsp::RTSPMediaFactory {
     let factory = rtsp::RTSPMediaFactory::new();
     let payloader = match footage.codec {
         Codec::H264 => "rtph264pay aggregate-mode=zero-latency",
@@ -328,11 +385,15 @@ fn factory(footage: Arc<Footage>, looped: bool, feeds: Arc<Feeds>) -> rtsp::RTSP
     factory.set_launch(&format!("( appsrc name=feed ! {payloader} name=pay0 pt=96 config-interval=-1 )"));
     factory.set_shared(false);
     factory.connect_media_configure(move |_, media| {
-        let feed = media.element().downcast::<gst::Bin>().ok().and_then(|bin| bin.by_name("feed"));
-        let Some(source) = feed.and_then(|feed| feed.downcast::<gst_app::AppSrc>().ok()) else {
-            tracing::error!("the test camera's media has no appsrc");
+        let bin = media.element().downcast::<gst::Bin>().ok();
+        let part = |name| bin.as_ref().and_then(|bin| bin.by_name(name));
+        let source = part("feed").and_then(|feed| feed.downcast::<gst_app::AppSrc>().ok());
+        let packets_of = part("pay0").and_then(|payloader| payloader.static_pad("src"));
+        let (Some(source), Some(pad)) = (source, packets_of) else {
+            tracing::error!("the test camera's media lacks its source or its payloader");
             return;
         };
+        packets.watch(&pad);
         feeds.add(&source, footage.clone(), looped);
     });
     factory
