@@ -1,10 +1,11 @@
 //! Why a source was lost: one enum, a stable label for metrics, a text that says what to do.
 
-use std::net::{TcpStream, ToSocketAddrs};
-use std::time::Duration;
+use std::net::ToSocketAddrs;
+use std::time::{Duration, Instant};
 
 use gstreamer as gst;
 
+use super::knock;
 use super::url::{Location, SourceUrl};
 
 /// Why a source was lost. The texts never contain a password.
@@ -139,19 +140,13 @@ pub(crate) const RTSP_TIMEOUT: Duration = Duration::from_secs(4);
 /// GStreamer says "Failed to connect" for everything: asks the network itself. `None` when the
 /// port takes connections, so that something else is wrong.
 fn probe(url: &SourceUrl) -> Option<Failure> {
-    let (host, port) = match url.location() {
-        Location::Rtsp { host, port, .. } | Location::Http { host, port, .. } => (host.as_str(), *port),
-        _ => return None,
+    let (Location::Rtsp { host, port, .. } | Location::Http { host, port, .. }) = url.location() else {
+        return None;
     };
-    let Ok(mut addresses) = (host, port).to_socket_addrs() else {
+    let Ok(mut addresses) = (host.as_str(), *port).to_socket_addrs() else {
         return Some(Failure::UnknownHost);
     };
-    let address = addresses.next()?;
-    match TcpStream::connect_timeout(&address, Duration::from_secs(1)) {
-        Ok(_) => None,
-        Err(e) if e.kind() == std::io::ErrorKind::ConnectionRefused => Some(Failure::Refused),
-        Err(_) => Some(Failure::Unreachable),
-    }
+    knock::connect_to(&addresses.next()?, Instant::now() + Duration::from_secs(1)).err()
 }
 
 /// GStreamer's message and the last line of its debug text, which holds the cause.

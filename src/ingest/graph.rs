@@ -4,6 +4,7 @@
 //! failed avoided the next time. `videoconvert` passes I420 through untouched and works only for
 //! decoders that give something else.
 
+use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Instant;
@@ -16,6 +17,7 @@ use gstreamer_video as gst_video;
 use super::backlog;
 use super::decoder;
 use super::failure::{Failure, RTSP_TIMEOUT};
+use super::line::Line;
 use super::spec::{Pacing, SourceSpec, Transport};
 use super::url::{Location, Login};
 
@@ -27,6 +29,8 @@ pub(crate) struct Graph {
     pub pipeline: gst::Pipeline,
     pub sink: gst_app::AppSink,
     pub shared: Arc<Shared>,
+    /// Its RTSP connection.
+    pub line: Option<Arc<Line>>,
 }
 
 impl Drop for Graph {
@@ -92,8 +96,13 @@ impl Shared {
     }
 }
 
-/// Builds the pipeline for one connection; nothing flows yet.
-pub(crate) fn build(spec: &SourceSpec, transport: Transport, avoid: &[String]) -> Result<Graph, Failure> {
+/// Builds the pipeline for one connection, of a camera to one of `peers`; nothing flows yet.
+pub(crate) fn build(
+    spec: &SourceSpec,
+    transport: Transport,
+    avoid: &[String],
+    peers: Vec<SocketAddr>,
+) -> Result<Graph, Failure> {
     let pipeline = gst::Pipeline::new();
     let shared = Arc::new(Shared {
         started: Instant::now(),
@@ -122,9 +131,11 @@ pub(crate) fn build(spec: &SourceSpec, transport: Transport, avoid: &[String]) -
         software: spec.software_decoder,
         avoid: avoid.to_vec(),
     };
+    let mut line = None;
     match spec.url.location() {
         Location::Rtsp { uri, login, .. } => {
             let source = rtsp_source(spec, uri, login.as_ref(), transport)?;
+            line = Some(Line::of(&source, peers));
             pipeline.add(&source).map_err(internal)?;
             depayload_pads_of(&pipeline, &source, plug);
         }
@@ -178,7 +189,7 @@ pub(crate) fn build(spec: &SourceSpec, transport: Transport, avoid: &[String]) -
             *shared.facts() = Facts { codec: Some("raw".into()), ..Facts::default() };
         }
     }
-    Ok(Graph { pipeline, sink, shared })
+    Ok(Graph { pipeline, sink, shared, line })
 }
 
 /// Threads of a software decoder. Each delays the picture by a frame, which a live one cannot afford; of

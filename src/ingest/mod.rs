@@ -1,7 +1,8 @@
 //! Camera -> frames.
 //!
 //! [`start`] opens a [`SourceSpec`] on a thread of its own and hands every decoded frame, and
-//! everything else that happens, to a sink. A camera is reconnected for ever.
+//! everything else that happens, to a sink. A camera is reconnected for ever: its door is knocked at before GStreamer
+//! goes in, and its connection can be cut when GStreamer does not come out.
 //!
 //! ```text
 //! rtspsrc -> depayloader \
@@ -16,9 +17,12 @@
 
 mod backlog;
 mod backoff;
+mod clock;
 mod decoder;
 mod failure;
 mod graph;
+mod knock;
+mod line;
 mod pattern;
 mod picture;
 mod source;

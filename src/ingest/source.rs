@@ -1,5 +1,6 @@
 //! A source's thread: `run` retries, `run_once` works.
 
+use std::net::SocketAddr;
 use std::ops::ControlFlow;
 use std::sync::mpsc;
 use std::sync::{Arc, Condvar, Mutex};
@@ -13,8 +14,10 @@ use tracing::{debug, info, warn};
 
 use super::backlog;
 use super::backoff::Backoff;
+use super::clock::{CaptureClock, Stamps};
 use super::failure::{self, Failure};
 use super::graph::{self, Graph};
+use super::knock::{self, Door};
 use super::picture;
 use super::spec::{Pacing, SourceError, SourceSpec, Transport};
 use super::timeline::{Mode, TimeLine};
@@ -141,6 +144,8 @@ pub fn start(
         let mut source = Source {
             camera,
             line: TimeLine::new(mode),
+            clock: CaptureClock::default(),
+            closing: Vec::new(),
             transport: if spec.transport == Transport::Udp { Transport::Udp } else { Transport::Tcp },
             spec,
             stop: told,
@@ -195,8 +200,10 @@ enum End {
 const PROVEN: Duration = Duration::from_secs(5);
 /// The camera's thread looks for errors and the stop flag this often.
 const TICK: gst::ClockTime = gst::ClockTime::from_mseconds(50);
-/// A camera's clock that is further off than this is not believed.
-const CLOCK_SANITY_NS: i64 = 24 * 3_600 * 1_000_000_000;
+/// A connection that is left takes no longer to close; then it is cut.
+const CLOSING: Duration = Duration::from_millis(300);
+/// So many of a camera's connections may be left behind that do not even close when cut; until then there is no other.
+const MOST_CLOSING: usize = 3;
 
 struct Source<S> {
     camera: CameraId,
@@ -204,6 +211,9 @@ struct Source<S> {
     stop: Arc<Stop>,
     sink: S,
     line: TimeLine,
+    clock: CaptureClock,
+    /// Connections that do not close.
+    closing: Vec<mpsc::Receiver<()>>,
     /// For RTSP: the transport of the next connection.
     transport: Transport,
     /// Decoders that failed on this stream.
@@ -217,11 +227,9 @@ impl<S: FnMut(SourceEvent) -> ControlFlow<()>> Source<S> {
         let mut backoff = Backoff::default();
         loop {
             self.line.restart();
+            self.clock.restart();
             let mut flow = Flow::default();
-            let end = match graph::build(&self.spec, self.transport, &self.avoid) {
-                Ok(graph) => self.run_once(&graph, &mut flow),
-                Err(failure) => End::Lost(failure),
-            };
+            let end = self.attempt(&mut flow);
             let reason = match end {
                 End::Stopped => return ControlFlow::Break(()),
                 End::Eos if flow.frames == 0 => Failure::Garbage("it ended before the first frame".into()),
@@ -236,13 +244,85 @@ impl<S: FnMut(SourceEvent) -> ControlFlow<()>> Source<S> {
                 backoff.reset();
             }
             self.switch_transport(&reason, flow.frames);
-            let retry_in = self.spec.retries().then(|| backoff.next());
+            // A password that has worked is not wrong.
+            let refused = reason == Failure::Unauthorized && !self.proven;
+            let most = if refused { Backoff::LATER } else { Backoff::SOON };
+            let retry_in = self.spec.retries().then(|| backoff.next(most));
             warn!(camera = %self.camera, source = %self.spec.url, reason = reason.label(), ?retry_in, "lost: {reason}");
             (self.sink)(SourceEvent::Lost { reason, retry_in })?;
             match retry_in {
                 Some(wait) if !self.stop.wait(wait) => {}
                 _ => return ControlFlow::Break(()),
             }
+        }
+    }
+
+    /// From the knock at the door to the end of the connection.
+    fn attempt(&mut self, flow: &mut Flow) -> End {
+        self.closing.retain(|closed| closed.try_recv() == Err(mpsc::TryRecvError::Empty));
+        if self.closing.len() >= MOST_CLOSING {
+            let what = "the camera does not let go of connections that were left";
+            return End::Lost(Failure::Garbage(what.into()));
+        }
+        let peers = match self.knock() {
+            Ok(peers) => peers,
+            Err(end) => return end,
+        };
+        match graph::build(&self.spec, self.transport, &self.avoid, peers) {
+            Ok(graph) => {
+                let end = self.run_once(&graph, flow);
+                self.close(graph);
+                end
+            }
+            Err(failure) => End::Lost(failure),
+        }
+    }
+
+    /// The addresses of a camera that answers sensibly, or how the attempt ends.
+    fn knock(&self) -> Result<Vec<SocketAddr>, End> {
+        let Location::Rtsp { uri, host, port, .. } = self.spec.url.location() else { return Ok(Vec::new()) };
+        let uri = uri.starts_with("rtsp://").then(|| uri.clone());
+        let door = Door { host: host.clone(), port: *port, uri };
+        let (answer, answered) = mpsc::sync_channel(1);
+        // Its own thread, so that nobody who stops the camera waits for a name server or a dead host.
+        let knocks = std::thread::Builder::new().name(format!("knock-{}", self.camera));
+        let knocks = knocks.spawn(move || {
+            // Nobody waits for it any more, perhaps.
+            let _ = answer.send(knock::knock(&door));
+        });
+        knocks.map_err(|e| End::Lost(Failure::Other(format!("no thread for the connection: {e}"))))?;
+        loop {
+            match answered.recv_timeout(Duration::from(TICK)) {
+                Ok(outcome) => return outcome.map_err(End::Lost),
+                Err(mpsc::RecvTimeoutError::Timeout) if !self.stop.is_set() => {}
+                Err(mpsc::RecvTimeoutError::Timeout) => return Err(End::Stopped),
+                Err(mpsc::RecvTimeoutError::Disconnected) => {
+                    return Err(End::Lost(Failure::Other("the attempt to connect panicked".into())));
+                }
+            }
+        }
+    }
+
+    /// Takes the pipeline down. In the middle of a message GStreamer cannot be stopped: a camera whose message has no end
+    /// must not keep us.
+    fn close(&mut self, graph: Graph) {
+        let line = graph.line.clone();
+        let (done, closed) = mpsc::sync_channel(1);
+        let closes = std::thread::Builder::new().name(format!("close-{}", self.camera));
+        // Without a thread the pipeline goes with the closure, here.
+        let closes = closes.spawn(move || {
+            drop(graph);
+            // Nobody waits for it any more, perhaps.
+            let _ = done.send(());
+        });
+        let mut in_time = closes.is_err() || closed.recv_timeout(CLOSING).is_ok();
+        if let Some(line) = line {
+            line.cut();
+        }
+        in_time = in_time || closed.recv_timeout(CLOSING).is_ok();
+        if !in_time {
+            warn!(camera = %self.camera, "a connection does not close although it was cut; it is left behind");
+            self.closing.push(closed);
         }
     }
 
@@ -409,15 +489,11 @@ impl<S: FnMut(SourceEvent) -> ControlFlow<()>> Source<S> {
         flow.frames += 1;
         flow.last = Some(decoded);
         let time = self.line.place(pts, decoded);
-        let capture = match rtcp.filter(|ns| (ns - wall).abs() < CLOCK_SANITY_NS) {
-            _ if !self.spec.is_live() && self.spec.pacing == Pacing::AsFastAsPossible => {
-                CaptureTime { unix_ns: time.0, clock: Clock::Media }
-            }
-            Some(unix_ns) => CaptureTime { unix_ns, clock: Clock::Rtcp },
-            None => CaptureTime {
-                unix_ns: flow.in_order(wall - decoding.as_nanos() as i64),
-                clock: Clock::Arrival,
-            },
+        let capture = if !self.spec.is_live() && self.spec.pacing == Pacing::AsFastAsPossible {
+            CaptureTime { unix_ns: time.0, clock: Clock::Media }
+        } else {
+            let pts = pts.and_then(|pts| i64::try_from(pts).ok());
+            self.clock.capture(Stamps { pts, camera: rtcp, arrived: wall - decoding.as_nanos() as i64 })
         };
         let delivered = (self.sink)(SourceEvent::Frame(RawFrame { image, time, capture, decoded }));
         // A sink that blocks is no silence of the source.
@@ -454,26 +530,16 @@ struct Flow {
     first: Option<Instant>,
     last: Option<Instant>,
     frames: u64,
-    /// Arrival of the last frame, Unix nanoseconds.
-    arrived: i64,
     caps: Option<(gst::Caps, gst_video::VideoInfo)>,
 }
 
 impl Default for Flow {
     fn default() -> Self {
-        Self { opened: Instant::now(), first: None, last: None, frames: 0, arrived: 0, caps: None }
+        Self { opened: Instant::now(), first: None, last: None, frames: 0, caps: None }
     }
 }
 
 impl Flow {
-    /// A stream with B-frames brings a frame before those that are shown, and delivered, ahead of it:
-    /// it cannot have been captured before them. A wall clock that was set back is followed.
-    fn in_order(&mut self, arrived: i64) -> i64 {
-        let behind = self.arrived - arrived;
-        self.arrived = if (0..1_000_000_000).contains(&behind) { self.arrived } else { arrived };
-        self.arrived
-    }
-
     /// The picture's format; the caps change when a camera changes its resolution.
     fn info(&mut self, sample: &gst::Sample) -> Option<gst_video::VideoInfo> {
         let caps = sample.caps_owned()?;

@@ -13,7 +13,7 @@ fn check_retrying(service: &Service, name: &str, kinds: &[&str]) {
     let kind = status["last_error_kind"].as_str().unwrap();
     assert!(kinds.contains(&kind), "{status}");
     assert!(!status["last_error"].as_str().unwrap().is_empty(), "{status}");
-    assert!(status["next_retry_s"].as_f64().is_some_and(|s| (0.0..=30.0).contains(&s)), "{status}");
+    assert!(status["next_retry_s"].as_f64().is_some_and(|s| (0.0..=3.0).contains(&s)), "{status}");
     let metrics = service.metrics();
     assert_eq!(metrics.of("gakp_camera_up", name), 0.0, "{name}");
     let failures = format!("gakp_camera_failures_total{{camera=\"{name}\",kind=\"{kind}\"}}");
