@@ -1,36 +1,18 @@
 //! A camera that goes wrong in every way that the test camera knows: what a source makes of it.
 #![cfg(feature = "testcam")]
 
+#[path = "faults/expected.rs"]
+mod expected;
 #[path = "ingest_help/mod.rs"]
 mod ingest_help;
 
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
+use expected::expected;
 use gakp::ingest::testcam::{Fault, TestCamera, TestCameraConfig, TestCameraError};
 use gakp::ingest::{RawFrame, SourceEvent, SourceSpec, Transport};
 use gakp::types::Clock;
 use ingest_help::{Clip, Live, PATIENCE};
-
-/// What a source says of a fault: one of these labels, or nothing, because the stream goes on.
-fn expected(fault: Fault, transport: Transport) -> &'static [&'static str] {
-    match fault {
-        Fault::Refuse => &["disconnected", "refused"],
-        // Over UDP the end of the RTSP connection is no end: the pictures stay away.
-        Fault::HangUp | Fault::NoSenderReports if transport == Transport::Udp => &["disconnected", "silent"],
-        Fault::HangUp | Fault::NoSenderReports => &["disconnected"],
-        Fault::Unauthorized => &["unauthorized"],
-        Fault::WrongCodec => &["unsupported"],
-        Fault::HalfOpen | Fault::Freeze => &["silent"],
-        // GStreamer throws away what has a lower number than the first packet, so that this looks like silence.
-        Fault::RestartClock => &["silent"],
-        Fault::Noise => &["garbage", "silent"],
-        Fault::Garbage if transport == Transport::Udp => &["garbage", "silent"],
-        Fault::Garbage => &["garbage"],
-        Fault::EndlessHeader => &["silent"],
-        Fault::JumpForward | Fault::JumpBackward | Fault::Resolution | Fault::FrameRate => &[],
-        Fault::Loss | Fault::MuteTeardown => &[],
-    }
-}
 
 /// A camera's life, from before the fault to after it.
 struct Watched {

@@ -7,16 +7,24 @@ mod account;
 mod analytics;
 #[path = "service/clients.rs"]
 mod clients;
+#[path = "service/crashes.rs"]
+mod crashes;
 #[path = "service/ending.rs"]
 mod ending;
+#[path = "faults/expected.rs"]
+mod expected;
 #[path = "service/failures.rs"]
 mod failures;
+#[path = "service/faults.rs"]
+mod faults;
 #[path = "service/grpc.rs"]
 mod grpc;
 #[path = "grpc/client.rs"]
 mod grpc_client;
 #[path = "service/history.rs"]
 mod history;
+#[path = "service/ledger.rs"]
+mod ledger;
 #[path = "service/masks.rs"]
 mod masks;
 #[path = "service/page.rs"]

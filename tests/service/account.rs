@@ -1,82 +1,20 @@
 //! Every frame is accounted for and every hole is announced, whatever happens at either end.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use gakp::ingest::testcam::{TestCamera, TestCameraConfig};
-use jiff::Timestamp;
-use tokio_tungstenite::tungstenite::{self, Message};
 
+use super::ledger::{Ended, Ledger};
 use super::support::*;
 
-/// What a subscriber was told: reports and announced holes by camera, in order and without any hole
-/// that was not announced.
-#[derive(Debug, Default)]
-struct Ledger {
-    next: BTreeMap<String, u64>,
-    epochs: BTreeMap<String, u64>,
-    reports: u64,
-    missed: u64,
-    /// The age of the oldest report when it was read, seconds.
-    oldest: f64,
-}
-
-impl Ledger {
-    fn take(&mut self, message: &Message) {
-        let Message::Text(text) = message else { panic!("not a text message: {message:?}") };
-        let message: serde_json::Value = serde_json::from_str(text).unwrap();
-        let camera = message["camera"].as_str().unwrap().to_owned();
-        let epoch = message["epoch"].as_u64().unwrap();
-        assert_eq!(*self.epochs.entry(camera.clone()).or_insert(epoch), epoch, "{message}");
-        let (first, last) = match message.get("gap") {
-            Some(gap) => (gap["first"].as_u64().unwrap(), gap["last"].as_u64().unwrap()),
-            None => (message["seq"].as_u64().unwrap(), message["seq"].as_u64().unwrap()),
-        };
-        if message.get("gap").is_some() {
-            assert!(message.get("seq").is_none() && last >= first, "{message}");
-            self.missed += last - first + 1;
-        } else {
-            self.reports += 1;
-            let captured: Timestamp = message["capture_ts"].as_str().unwrap().parse().unwrap();
-            self.oldest = self.oldest.max(Timestamp::now().duration_since(captured).as_secs_f64());
-        }
-        // The first report tells where this subscriber began.
-        let expected = self.next.insert(camera, last + 1).unwrap_or(first);
-        assert_eq!(first, expected, "a hole that was not announced, or something twice: {message}");
-    }
-
-    /// Reads until `enough`, which is asked before every message.
-    fn read(mut self, mut socket: Socket, enough: impl Fn(&Self) -> bool) -> (Self, Ended) {
-        let since = Instant::now();
-        while !enough(&self) {
-            assert!(since.elapsed() < 4 * PATIENCE, "read on and on: {self:?}");
-            match socket.message() {
-                Ok(Message::Close(_)) => return (self, Ended::ByService),
-                Ok(message) => self.take(&message),
-                Err(tungstenite::Error::Io(error)) if error.kind() == std::io::ErrorKind::WouldBlock => {
-                    panic!("nothing came for a long time: {self:?}")
-                }
-                Err(_) => return (self, Ended::ByService),
-            }
-        }
-        (self, Ended::Enough)
-    }
-
-    /// A slow one was told what it missed, or it was cut off: on a machine so busy that half a minute
-    /// of reports do not fill a ring.
-    fn check_told(&self, how: Ended) {
-        eprintln!("slow: {how:?} after {} reports, {} missed", self.reports, self.missed);
-        assert!(self.missed > 0 || how == Ended::ByService, "{self:?}");
-    }
-}
-
-#[derive(Debug, PartialEq)]
-enum Ended {
-    Enough,
-    ByService,
+/// A slow one was told what it missed, or it was cut off: on a machine so busy that half a minute
+/// of reports do not fill a ring.
+fn check_told(ledger: &Ledger, how: &Ended) {
+    eprintln!("slow: {how:?} after {} reports, {} missed", ledger.reports, ledger.missed);
+    assert!(ledger.missed > 0 || *how == Ended::ByService, "{ledger:?}");
 }
 
 #[test]
@@ -143,9 +81,9 @@ fn every_frame_is_accounted_for_and_every_hole_announced() {
     });
     hurry.store(true, Ordering::Relaxed);
     let (slow, how) = slow.join().unwrap();
-    slow.check_told(how);
+    check_told(&slow, &how);
     let (mute, how) = Ledger::default().read(mute, |ledger| ledger.missed > 0);
-    mute.check_told(how);
+    check_told(&mute, &how);
 
     // No camera any more: what is in flight is finished, and then every account is balanced.
     gate.kill();

@@ -176,6 +176,10 @@ impl Process {
         self.log.lock().unwrap().clone()
     }
 
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Sends a signal by its name: `TERM`, `STOP`, `CONT`, `KILL`.
     pub fn signal(&self, name: &str) {
         let kill = format!("kill -{name} {}", self.child.id());
@@ -306,22 +310,35 @@ impl Service {
         self.request_with(&format!("Authorization: Bearer {token}\r\n"), method, path, json)
     }
 
-    /// With more header lines, each with its line break. HTTP/1.0: the answer ends with the connection and has no chunks.
+    /// With more header lines, each with its line break.
     pub fn request_with(&self, headers: &str, method: &str, path: &str, json: Option<&str>) -> Response {
-        let mut stream = connect(self.address);
+        self.try_request(headers, method, path, json).unwrap()
+    }
+
+    /// Of a service that may not be there any more. HTTP/1.0: the answer ends with the connection and has no chunks.
+    pub fn try_request(
+        &self,
+        headers: &str,
+        method: &str,
+        path: &str,
+        json: Option<&str>,
+    ) -> std::io::Result<Response> {
+        let mut stream = TcpStream::connect(self.address)?;
+        stream.set_read_timeout(Some(PATIENCE))?;
         let mut head = format!("{method} {path} HTTP/1.0\r\nHost: {}\r\n{headers}", self.address);
         if let Some(json) = json {
             head += &format!("Content-Type: application/json\r\nContent-Length: {}\r\n", json.len());
         }
-        stream.write_all(format!("{head}\r\n{}", json.unwrap_or("")).as_bytes()).unwrap();
+        stream.write_all(format!("{head}\r\n{}", json.unwrap_or("")).as_bytes())?;
         let mut bytes = Vec::new();
-        stream.read_to_end(&mut bytes).unwrap();
-        let end = bytes.windows(4).position(|four| four == b"\r\n\r\n").expect("a response head");
+        stream.read_to_end(&mut bytes)?;
+        let end = bytes.windows(4).position(|four| four == b"\r\n\r\n");
+        let end = end.ok_or_else(|| std::io::Error::other("no response head"))?;
         let head = String::from_utf8_lossy(&bytes[..end]).into_owned();
         let bytes = bytes.split_off(end + 4);
         let body = String::from_utf8_lossy(&bytes).into_owned();
         let status = head.split(' ').nth(1).unwrap().parse().unwrap();
-        Response { status, head, body, bytes }
+        Ok(Response { status, head, body, bytes })
     }
 
     /// What the API says of a camera.

@@ -1,0 +1,24 @@
+//! What a process holds: memory, threads, descriptors.
+
+use std::fs;
+
+/// Of one moment.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Vitals {
+    /// Resident memory, MB.
+    pub resident: f64,
+    pub threads: usize,
+    pub descriptors: usize,
+}
+
+impl Vitals {
+    pub fn of(process: u32) -> Self {
+        let folder = format!("/proc/{process}");
+        let count = |what: &str| fs::read_dir(format!("{folder}/{what}")).expect("a process").count();
+        let status = fs::read_to_string(format!("{folder}/status")).expect("a process");
+        let resident = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+        let kilobytes = resident.and_then(|line| line.split_whitespace().next()?.parse::<f64>().ok());
+        let resident = kilobytes.expect("VmRSS in kB") * 1024e-6;
+        Self { resident, threads: count("task"), descriptors: count("fd") }
+    }
+}
