@@ -172,9 +172,6 @@ fn kill_9_under_load_loses_nothing_that_was_acknowledged() {
     check(&service, &mut book);
     let log = service.stop();
     assert!(!log.contains("panicked"), "{log}");
-    eprintln!(
-        "{runs} crashes, {changes} changes, {told} events told, {} tracks kept",
-        tracks.len()
-    );
+    eprintln!("{runs} crashes, {changes} changes, {told} events told, {} tracks kept", tracks.len());
     assert!(changes > runs && told > 0 && !tracks.is_empty(), "the test was too gentle");
 }
