@@ -24,6 +24,8 @@ const CAMERAS: usize = 16;
 const WORKERS: usize = 4;
 /// Times between which one looks.
 const STEPS: usize = 10;
+/// Idle threads of a pool end after 10 s.
+const REST: Duration = Duration::from_secs(12);
 
 /// A look: how many it has been, and what the service holds.
 type Look = (usize, Vitals);
@@ -34,7 +36,12 @@ struct Bench {
 }
 
 impl Bench {
+    /// Once everything is at rest: all cameras live, and idle threads of a pool gone.
     fn look(&self, count: usize) -> Look {
+        for index in 0..self.cameras.len() {
+            self.service.wait_for_state(&Self::name(index), "live");
+        }
+        std::thread::sleep(REST);
         let vitals = Vitals::of(self.service.process.id());
         println!("{count:6}  {:11.1}  {:7}  {:11}", vitals.resident, vitals.threads, vitals.descriptors);
         (count, vitals)
@@ -98,8 +105,6 @@ impl Bench {
         repeat(self, count);
         let mut looks = vec![];
         for step in 0..=STEPS {
-            // Idle threads of a pool take a while to end.
-            std::thread::sleep(Duration::from_secs(if step == 0 || step == STEPS { 15 } else { 1 }));
             looks.push(self.look(count + step * count / STEPS));
             if step < STEPS {
                 repeat(self, count / STEPS);

@@ -248,10 +248,19 @@ impl Manifest {
     /// # Errors
     /// [`InferError::Manifest`]: not there, no TOML, unknown or missing keys, impossible values.
     pub fn read(path: &Path) -> Result<Self, InferError> {
+        let unreadable =
+            |e| InferError::Manifest { path: path.into(), reason: format!("cannot be read: {e}") };
+        Self::parse(path, &fs::read_to_string(path).map_err(unreadable)?)
+    }
+
+    /// Checks the text of the manifest that lies at `path`.
+    ///
+    /// # Errors
+    /// As [`Manifest::read`].
+    pub fn parse(path: &Path, text: &str) -> Result<Self, InferError> {
         let wrong = |reason: String| InferError::Manifest { path: path.into(), reason };
-        let text = fs::read_to_string(path).map_err(|e| wrong(format!("cannot be read: {e}")))?;
         let File { model: models } =
-            toml::from_str(&text).map_err(|e| wrong(format!("is not a manifest: {e}")))?;
+            toml::from_str(text).map_err(|e| wrong(format!("is not a manifest: {e}")))?;
         for (index, model) in models.iter().enumerate() {
             model.check().map_err(|reason| wrong(format!("model {:?}: {reason}", model.name)))?;
             if models[..index].iter().any(|other| other.name == model.name) {
