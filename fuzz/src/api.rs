@@ -47,7 +47,7 @@ pub fn requests(data: &[u8]) {
             raw.extend(frames);
             raw
         }
-        _ => [b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0", data].concat(),
+        _ => [b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", data].concat(),
     };
     let answer = talk(address, &raw);
     let failed = answer.starts_with(b"HTTP/1.1 5") || answer.starts_with(b"HTTP/1.0 5");
@@ -64,12 +64,12 @@ impl std::fmt::Debug for Lossy<'_> {
     }
 }
 
-/// One of the routes, with bytes for its names, query and body.
+/// One of the routes; then, with a zero byte in between, its names, query and body.
 fn request(data: &[u8]) -> Vec<u8> {
     let Some((which, data)) = data.split_first() else { return vec![] };
     let (method, path, _) = RIGHTS[usize::from(*which) % RIGHTS.len()];
-    let (names, body) = halves(data);
-    let (name, query) = halves(names);
+    let (name, rest) = halves(data);
+    let (query, body) = halves(rest);
     let name = if name.is_empty() { "gate".into() } else { escaped(name) };
     let mut path = path.to_owned();
     while let (Some(begin), Some(end)) = (path.find('{'), path.find('}')) {

@@ -2,6 +2,7 @@
 //! `tests/fuzz.rs` of the crate does it for a while with every compiler.
 
 mod api;
+pub mod seeds;
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -114,10 +115,13 @@ pub fn manifest(data: &[u8]) {
 pub fn url(data: &[u8]) {
     let text = String::from_utf8_lossy(data);
     if let Ok(url) = SourceUrl::parse(&text) {
-        let shown = format!("{url} {url:?} {}", url.redacted());
-        assert_eq!(url.scrub(url.redacted()), url.redacted(), "of {text:?}: {shown}");
+        let again = SourceUrl::parse(url.with_secrets()).expect("what was read reads the same again");
+        assert_eq!(again, url);
     }
     let secret = "Xk7qPz";
+    if text.contains(secret) {
+        return;
+    }
     let with_login = format!("rtsp://user{}:{secret}{text}", text.len());
     if let Ok(url) = SourceUrl::parse(&with_login) {
         let shown = format!("{url} {url:?} {} {}", url.redacted(), url.scrub(&with_login));
@@ -175,7 +179,8 @@ pub fn tracker(data: &[u8]) {
     let (mut time, mut request) = (MediaTime::default(), LinkRequest::default());
     let (mut known, mut ended) = (BTreeSet::new(), BTreeSet::new());
     let mut newest = 0;
-    while let Ok(frame) = FuzzedFrame::arbitrary(&mut unstructured) {
+    while !unstructured.is_empty() {
+        let Ok(frame) = FuzzedFrame::arbitrary(&mut unstructured) else { return };
         time = MediaTime(time.0.wrapping_add(frame.step));
         let detections = detections(&frame);
         let embedding = frame.embedding.and_then(|values| Embedding::normalised(values.to_vec()));

@@ -249,8 +249,8 @@ fn redact_query(path: &str, secrets: &mut Vec<String>) -> String {
     let mut out = String::with_capacity(path.len());
     let mut rest = path;
     while let Some(equals) = rest.find('=') {
-        let key_start = rest[..equals].rfind(|c: char| !c.is_ascii_alphanumeric()).map_or(0, |i| i + 1);
-        let key = rest[key_start..equals].to_ascii_lowercase();
+        let key = rest[..equals].rsplit(|c: char| !c.is_ascii_alphanumeric()).next();
+        let key = key.unwrap_or_default().to_ascii_lowercase();
         out.push_str(&rest[..=equals]);
         rest = &rest[equals + 1..];
         if KEYS.contains(&key.as_str()) {
@@ -304,6 +304,7 @@ mod tests {
             ("rtsp://u:hunter2%21@cam/live", "rtsp://u:***@cam/live"),
             ("rtsp://cam/x?user=u&password=hunter2&n=1", "rtsp://cam/x?user=u&password=***&n=1"),
             ("http://cam/v.m3u8?token=hunter2", "http://cam/v.m3u8?token=***"),
+            ("rtsp://cam/ü😀password=hunter2", "rtsp://cam/ü😀password=***"),
             ("rtsp://cam/user=u_password=hunter2_channel=1/x", "rtsp://cam/user=u_password=***/x"),
         ] {
             let url = SourceUrl::parse(text).unwrap();
