@@ -18,6 +18,7 @@ use crate::auth::{Gate, TokenFile};
 use crate::config::{Config, TrackerOptions};
 use crate::history::{History, HistoryMetrics, HistorySettings, Pictures};
 use crate::infer::Models;
+use crate::ingest::memory;
 use crate::notify::{Notifier, NotifyPlan, RememberedWebhooks};
 use crate::pipeline::{CameraSet, Lanes, MAX_CAMERAS, SetConfig, Store, source_spec};
 use crate::publish::{EventHub, Hub, HubConfig};
@@ -82,6 +83,7 @@ const DRAIN: Duration = Duration::from_millis(4500);
 /// # Errors
 /// A setting, a model, the address or the state folder is wrong; no camera was opened then.
 pub fn run(args: Args) -> Result<()> {
+    memory::arena_a_core();
     let plan = Plan::new(args)?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .thread_name("async")

@@ -23,6 +23,7 @@ mod failure;
 mod graph;
 mod knock;
 mod line;
+pub mod memory;
 mod pattern;
 mod picture;
 mod source;

@@ -18,6 +18,7 @@ use super::clock::{CaptureClock, Stamps};
 use super::failure::{self, Failure};
 use super::graph::{self, Graph};
 use super::knock::{self, Door};
+use super::memory;
 use super::picture;
 use super::spec::{Pacing, SourceError, SourceSpec, Transport};
 use super::timeline::{Mode, TimeLine};
@@ -314,6 +315,7 @@ impl<S: FnMut(SourceEvent) -> ControlFlow<()>> Source<S> {
             drop(graph);
             // Nobody waits for it any more, perhaps.
             let _ = done.send(());
+            memory::give_back();
         });
         let mut in_time = closes.is_err() || closed.recv_timeout(CLOSING).is_ok();
         if let Some(line) = line {
