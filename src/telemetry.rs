@@ -22,7 +22,7 @@ pub enum DropReason {
     Undecoded,
     /// The decoder marked the picture as damaged.
     Corrupt,
-    /// A model failed on it.
+    /// A model or the tracker failed on it.
     Inference,
     /// Its camera was removed, or the service stopped.
     Stopped,

@@ -170,6 +170,17 @@ impl CameraView {
         self.state.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
+    /// It cannot go on.
+    fn broken(&self, why: &str) {
+        tracing::error!(camera = %self.id, "{why}");
+        self.change(|condition| {
+            condition.state = CameraState::Failed;
+            condition.last_failure = Some(Failure::Other(why.to_owned()));
+            condition.next_retry = None;
+            condition.fps = None;
+        });
+    }
+
     fn change(&self, change: impl FnOnce(&mut Condition)) {
         let mut condition = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let before = condition.state;
@@ -214,12 +225,15 @@ impl Camera {
         );
         let detector = lanes.models.detector.clone();
         let detect = detect::run(mailbox.clone(), detector, in_flight, to_embed, lanes.metrics.clone());
+        let (its, frames) = (view.clone(), mailbox.clone());
         let flow = tokio::spawn(async move {
             // Two tasks, so that a slow camera's stages still overlap.
             let (embed, detect) = (tokio::spawn(embed), tokio::spawn(detect));
             for stage in [detect, embed] {
                 if stage.await.is_err() {
-                    tracing::error!("a camera's stage panicked");
+                    its.broken("a stage of it panicked: remove the camera and add it again");
+                    // Its source ends.
+                    frames.close();
                 }
             }
             seat.leave().await;

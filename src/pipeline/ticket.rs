@@ -7,7 +7,7 @@ use crate::telemetry::{CameraMetrics, DropReason};
 use crate::traces::{FrameTrace, Outcome, Step};
 
 /// One frame's place in the account. Made when the frame comes in, settled exactly once: as tracked,
-/// as dropped for a reason, or, when it is let go of unsettled, as stopped.
+/// as dropped for a reason, or, when it is let go of unsettled, as stopped (by a panic, as failed).
 pub struct Ticket {
     metrics: Arc<CameraMetrics>,
     trace: Option<Box<FrameTrace>>,
@@ -56,7 +56,8 @@ impl Ticket {
 impl Drop for Ticket {
     fn drop(&mut self) {
         if !self.settled {
-            self.settle(DropReason::Stopped);
+            let panics = std::thread::panicking();
+            self.settle(if panics { DropReason::Inference } else { DropReason::Stopped });
         }
     }
 }

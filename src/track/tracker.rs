@@ -118,6 +118,13 @@ impl Tracker {
         }
     }
 
+    /// A new one in its place, which goes on with the ids, and those that end with this one. After a panic in the middle of
+    /// a frame nothing else of it is to be relied on.
+    pub fn renewed(self) -> (Self, Vec<TrackId>) {
+        let ended = self.tracks.iter().map(|track| track.id).collect();
+        (Self { next_id: self.next_id, ..Self::new(self.config) }, ended)
+    }
+
     /// Live tracks, in the order of their ids.
     pub fn tracks(&self) -> &[Tracklet] {
         &self.tracks

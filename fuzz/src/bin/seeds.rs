@@ -2,6 +2,9 @@
 
 use std::path::PathBuf;
 
+// It is built as the targets are, and what they are instrumented with is in here.
+use libfuzzer_sys as _;
+
 fn main() -> std::io::Result<()> {
     let mut args = std::env::args().skip(1);
     let (Some(target), Some(folder)) = (args.next(), args.next()) else {
