@@ -111,21 +111,13 @@ impl Bench {
             }
         }
         let (first, last) = (looks[0].1, looks[STEPS].1);
-        println!("slope of the memory: {:.2} MB a thousand (limit 1)", 1000.0 * slope(&looks));
+        let points: Vec<_> = looks.iter().map(|(count, vitals)| (*count as f64, vitals.resident)).collect();
+        println!("slope of the memory: {:.2} MB a thousand (limit 1)", 1000.0 * vitals::slope(&points));
         println!(
             "threads {} -> {}, descriptors {} -> {} (limit: the same)",
             first.threads, last.threads, first.descriptors, last.descriptors
         );
     }
-}
-
-/// Least squares, MB each.
-fn slope(looks: &[Look]) -> f64 {
-    let n = looks.len() as f64;
-    let mean = |of: &dyn Fn(&Look) -> f64| looks.iter().map(of).sum::<f64>() / n;
-    let (x, y) = (mean(&|look| look.0 as f64), mean(&|look| look.1.resident));
-    let covariance = mean(&|look| (look.0 as f64 - x) * (look.1.resident - y));
-    covariance / mean(&|look| (look.0 as f64 - x).powi(2))
 }
 
 fn main() {

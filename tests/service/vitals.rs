@@ -22,3 +22,12 @@ impl Vitals {
         Self { resident, threads: count("task"), descriptors: count("fd") }
     }
 }
+
+/// Least squares of (x, y), in y an x.
+#[allow(dead_code, reason = "not every user looks at slopes")]
+pub fn slope(looks: &[(f64, f64)]) -> f64 {
+    let n = looks.len() as f64;
+    let mean = |of: &dyn Fn(&(f64, f64)) -> f64| looks.iter().map(of).sum::<f64>() / n;
+    let (x, y) = (mean(&|look| look.0), mean(&|look| look.1));
+    mean(&|look| (look.0 - x) * (look.1 - y)) / mean(&|look| (look.0 - x).powi(2))
+}
