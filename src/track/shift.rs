@@ -11,6 +11,9 @@ use super::association::match_pairs;
 use super::nearby::Nearby;
 use crate::types::BBox;
 
+/// Pixels; more is garbage.
+const MAX_SHIFT: f64 = 1e6;
+
 /// The camera's motion between two frames.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Shift {
@@ -19,6 +22,14 @@ pub struct Shift {
     /// Variance of each, pixels^2: that of the median of `n` displacements whose standard deviation is `s`,
     /// `pi s^2 / (2 n)`, and the square of what the shrinkage holds back.
     pub variance: [f64; 2],
+}
+
+impl Shift {
+    /// Whether its numbers are finite, at most 1e6 pixels, and its variances not negative.
+    pub fn is_usable(&self) -> bool {
+        let near = self.by.iter().all(|by| by.abs() <= MAX_SHIFT);
+        near && self.variance.iter().all(|variance| (0.0..=MAX_SHIFT * MAX_SHIFT).contains(variance))
+    }
 }
 
 /// The shift from `predicted` boxes to `detections`; `None` when too few agree.
@@ -102,5 +113,16 @@ mod tests {
     fn says_nothing_of_two_people() {
         assert_eq!(global_shift(&ShiftConfig::default(), &people(0.0)[..2], &nearby(&people(5.0))), None);
         assert_eq!(global_shift(&ShiftConfig::default(), &people(0.0), &nearby(&people(5000.0))), None);
+    }
+
+    #[test]
+    fn garbage_is_not_usable() {
+        let shift = |dx, variance| Shift { by: [dx, 0.0], variance: [0.0, variance] };
+        assert!(Shift::default().is_usable() && shift(-3.5, 2.0).is_usable());
+        for garbage in [f64::NAN, f64::INFINITY, 1e300] {
+            assert!(!shift(garbage, 1.0).is_usable() && !shift(-garbage, 1.0).is_usable());
+            assert!(!shift(0.0, garbage).is_usable());
+        }
+        assert!(!shift(0.0, -1.0).is_usable());
     }
 }

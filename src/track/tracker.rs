@@ -30,8 +30,8 @@ pub struct FrameInput<'a> {
     pub detections: &'a [Detection],
     /// The detections' embeddings: empty, or one entry a detection.
     pub embeddings: &'a [Option<Embedding>],
-    /// The camera's shift since the frame that was predicted last, where the picture tells it; otherwise the
-    /// boxes may.
+    /// The camera's shift since the frame that was predicted last, where the picture tells it; otherwise, and
+    /// where it is not [usable](Shift::is_usable), the boxes may.
     pub shift: Option<Shift>,
 }
 
@@ -314,7 +314,8 @@ impl Tracker {
             .filter(|t| t.matched && t.hits >= config.min_hits)
             .map(Tracklet::bbox)
             .collect();
-        if let Some(shift) = told.or_else(|| global_shift(config, &seen, &self.high)) {
+        if let Some(shift) = told.filter(Shift::is_usable).or_else(|| global_shift(config, &seen, &self.high))
+        {
             for track in &mut self.tracks {
                 track.shift(&shift);
             }
