@@ -27,6 +27,8 @@ mod history;
 mod ledger;
 #[path = "service/masks.rs"]
 mod masks;
+#[path = "service/overload.rs"]
+mod overload;
 #[path = "service/page.rs"]
 mod page;
 #[path = "browser/playwright.rs"]

@@ -219,7 +219,7 @@ pub enum CameraError {
     #[error("{0}")]
     Invalid(String),
     /// The service has as many cameras as it is allowed.
-    #[error("the limit of {0} cameras is reached; delete one first")]
+    #[error("the limit of {0} cameras is reached: delete one first, or raise max_cameras")]
     LimitReached(usize),
     /// A change of its lines or zones is refused.
     #[error(transparent)]

@@ -4,12 +4,13 @@ use std::ops::ControlFlow;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
-use tokio::sync::mpsc;
+use tokio::sync::{Semaphore, mpsc};
 use tokio::task::JoinHandle;
 
 use super::detect::{self, Captured};
 use super::outlet::Outlet;
 use super::tracker::{TrackerGone, TrackerThread};
+use super::turns::Turns;
 use super::{Mailbox, Policy, Ticket, embed, link};
 use crate::infer::Models;
 use crate::ingest::{self, Failure, Opened, RawFrame, SourceError, SourceEvent, SourceHandle, SourceSpec};
@@ -24,6 +25,9 @@ pub const MAX_CAMERAS: usize = 1024;
 /// Frames of a file that are decoded ahead.
 const AHEAD: usize = 8;
 
+/// Frames of a live camera behind the detector: one being embedded, one being tracked. More would grow old there.
+const BEYOND: usize = 2;
+
 /// Detections of a camera that may wait to be embedded.
 const DETECTED: usize = 2;
 
@@ -34,6 +38,7 @@ pub struct Lanes {
     tracker: TrackerThread,
     link: Option<JoinHandle<()>>,
     traces: Option<Traces>,
+    turns: Turns,
 }
 
 impl Lanes {
@@ -45,7 +50,8 @@ impl Lanes {
         // Without a scorer (an association that asks none) there is nobody to send jobs to, and none are.
         let stage = |linker| tokio::spawn(link::run(job_queue, linker, answers.downgrade()));
         let link = models.linker.clone().map(stage);
-        Ok(Self { models, metrics, tracker, link, traces: None })
+        let turns = Turns::new(models.detector.arrangement());
+        Ok(Self { models, metrics, tracker, link, traces: None, turns })
     }
 
     /// With traces of the cameras' frames.
@@ -215,7 +221,10 @@ impl Camera {
         // Live, a frame more than the workers take would only grow old. Offline, one waits for each
         // worker, so that none is idle between two frames.
         let workers = lanes.models.detector.arrangement().workers;
-        let in_flight = if policy == Policy::Wait { 2 * workers } else { workers };
+        let (in_flight, turns, places) = match policy {
+            Policy::Wait => (2 * workers, None, 4 * (workers + BEYOND)),
+            Policy::NewestWins => (workers, Some(lanes.turns.clone()), workers + BEYOND),
+        };
         let embed = embed::run(
             detected,
             lanes.models.embedder.clone(),
@@ -224,7 +233,8 @@ impl Camera {
             lanes.metrics.clone(),
         );
         let detector = lanes.models.detector.clone();
-        let detect = detect::run(mailbox.clone(), detector, in_flight, to_embed, lanes.metrics.clone());
+        let share = detect::Share { in_flight, places: Arc::new(Semaphore::new(places)), turns };
+        let detect = detect::run(mailbox.clone(), detector, share, to_embed, lanes.metrics.clone());
         let (its, frames) = (view.clone(), mailbox.clone());
         let flow = tokio::spawn(async move {
             // Two tasks, so that a slow camera's stages still overlap.

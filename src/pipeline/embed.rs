@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use futures::StreamExt;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::sync::{OwnedSemaphorePermit, mpsc};
 
 use super::Ticket;
 use super::detect::Detected;
@@ -24,12 +24,9 @@ pub struct Embedded {
     pub detections: Vec<Detection>,
     /// One entry a detection, or empty.
     pub embeddings: Vec<Option<Embedding>>,
-    /// The camera's share of the tracker's queue; given back when the frame is done.
-    pub permit: OwnedSemaphorePermit,
+    /// Its place among the camera's frames under way; given back when the frame is done.
+    pub place: OwnedSemaphorePermit,
 }
-
-/// Frames of one camera that may wait for the tracker.
-const AT_TRACKER: usize = 2;
 
 /// Runs until there are no more detections, or the tracker is gone. `embedder` is `None` when
 /// appearance is turned off.
@@ -41,14 +38,13 @@ pub async fn run(
     metrics: Arc<Metrics>,
 ) {
     let embed = metrics.stage(Stage::Embed);
-    let room = Arc::new(Semaphore::new(AT_TRACKER));
     let arriving = futures::stream::unfold(detected, |mut detected| async move {
         let next = detected.recv().await?;
         Some((next, detected))
     });
     let mut embedded = std::pin::pin!(
         arriving
-            .map(|Detected { frame, mut ticket, detections }| {
+            .map(|Detected { frame, mut ticket, detections, place }| {
                 let embedder = embedder.clone();
                 async move {
                     let start = Instant::now();
@@ -60,12 +56,12 @@ pub async fn run(
                         _ => Ok(Vec::new()),
                     };
                     ticket.step(Step::Embed, start);
-                    (frame, ticket, detections, answer, start.elapsed())
+                    (frame, ticket, detections, place, answer, start.elapsed())
                 }
             })
             .buffered(in_flight.max(1))
     );
-    while let Some((frame, ticket, detections, answer, took)) = embedded.next().await {
+    while let Some((frame, ticket, detections, place, answer, took)) = embedded.next().await {
         embed.observe(took.as_secs_f64());
         let embeddings = match answer {
             Ok(embeddings) => embeddings,
@@ -75,8 +71,7 @@ pub async fn run(
                 continue;
             }
         };
-        let Ok(permit) = room.clone().acquire_owned().await else { return };
-        if seat.frame(Embedded { frame, ticket, detections, embeddings, permit }).await.is_err() {
+        if seat.frame(Embedded { frame, ticket, detections, embeddings, place }).await.is_err() {
             return;
         }
     }

@@ -74,6 +74,19 @@ impl<T> Mailbox<T> {
         Ok(displaced)
     }
 
+    /// Waits for an entry; `false` once the mailbox is closed and empty. The only reader finds it there, or a newer one.
+    pub async fn ready(&self) -> bool {
+        loop {
+            {
+                let state = self.lock();
+                if !state.entries.is_empty() || state.closed {
+                    return !state.entries.is_empty();
+                }
+            }
+            self.readable.notified().await;
+        }
+    }
+
     /// The oldest entry; waits for one. `None` once the mailbox is closed and empty.
     pub async fn take(&self) -> Option<T> {
         loop {

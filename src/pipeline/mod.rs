@@ -10,9 +10,10 @@
 //!
 //! | queue | bound | when full |
 //! | --- | --- | --- |
-//! | `frames`, a camera's mailbox | 1 live, 2 offline | live: the older frame is dropped (`overload`); offline: the decoder waits |
+//! | `frames`, a camera's mailbox | 1 live, 8 offline | live: the older frame is dropped (`overload`); offline: the decoder waits |
+//! | the detector, all live cameras together | what its workers take, and one worker's next ([`turns`]) | the frame waits in its mailbox |
 //! | `detected`, detect to embed | 2 a camera | the stage before waits |
-//! | `tracker`, everything to the tracker | 2 frames a camera | the stage before waits |
+//! | from the mailbox to the tracks | the detector's workers and 2, live; offline four times as many | the frame waits in its mailbox |
 //! | `link`, pairs to be scored | 1 a camera | cannot be: a camera has one frame in hand |
 //!
 //! It is built sink first, so each stage owns its downstream mailbox. A frame carries a [`Ticket`]
@@ -29,6 +30,7 @@ mod set;
 mod store;
 mod ticket;
 mod tracker;
+mod turns;
 
 pub use analyst::CameraAnalyst;
 pub use camera::{Camera, CameraPlan, CameraState, CameraView, Condition, Lanes, MAX_CAMERAS, StartError};

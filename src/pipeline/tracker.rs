@@ -148,7 +148,7 @@ struct Desk {
     seq: u64,
     /// Tracks that ended with a tracker that failed; told with the next frame.
     orphans: Vec<TrackId>,
-    /// Frames behind the one in hand; at most [`super::embed::AT_TRACKER`].
+    /// Frames behind the one in hand; at most as many as the camera has under way.
     backlog: VecDeque<Embedded>,
     in_hand: Option<InHand>,
     leaving: Option<oneshot::Sender<()>>,
@@ -317,7 +317,7 @@ impl Desk {
         }
         // Older than any that ends now.
         ended.splice(..0, self.orphans.drain(..));
-        let Embedded { frame, mut ticket, permit, .. } = frame;
+        let Embedded { frame, mut ticket, place, .. } = frame;
         ticket.step(Step::Update, start);
         let updated = Instant::now();
         let report = FrameTracks {
@@ -351,7 +351,7 @@ impl Desk {
                 ticket.dropped(DropReason::Inference);
             }
         }
-        drop(permit);
+        drop(place);
     }
 }
 
@@ -412,7 +412,7 @@ mod tests {
             ticket: Ticket::new(metrics.clone(), None),
             detections: vec![person(2.0), person(40.0)],
             embeddings: vec![],
-            permit: room.try_acquire_owned().expect("a permit"),
+            place: room.try_acquire_owned().expect("a place"),
         }
     }
 
