@@ -1,5 +1,6 @@
 //! Arguments about models, shared by the commands that run them.
 
+use std::ffi::OsString;
 use std::path::PathBuf;
 
 use crate::config::ModelConfig;
@@ -54,6 +55,29 @@ impl From<ModelArgs> for ModelConfig {
             threads: args.threads,
             onnxruntime: args.onnxruntime,
         }
+    }
+}
+
+impl ModelArgs {
+    /// As they are written, for another process.
+    pub fn to_args(&self) -> Vec<OsString> {
+        let path = |path: &Option<PathBuf>| path.clone().map(OsString::from);
+        let text = |text: &Option<String>| text.clone().map(OsString::from);
+        let number = |number: Option<String>| number.map(OsString::from);
+        let given = [
+            ("--models", path(&self.models)),
+            ("--detector", text(&self.detector)),
+            ("--detector-size", number(self.detector_size.map(|(w, h)| format!("{w}x{h}")))),
+            ("--score-threshold", number(self.score_threshold.map(|score| score.to_string()))),
+            ("--classes", number(self.classes.as_ref().map(|classes| classes.join(",")))),
+            ("--reid", text(&self.reid)),
+            ("--link", text(&self.link)),
+            ("--provider", text(&self.provider)),
+            ("--threads", number(self.threads.map(|threads| threads.to_string()))),
+            ("--onnxruntime", path(&self.onnxruntime)),
+        ];
+        let both = given.into_iter().filter_map(|(flag, value)| Some([flag.into(), value?]));
+        both.flatten().collect()
     }
 }
 

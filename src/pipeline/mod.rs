@@ -11,7 +11,7 @@
 //! | queue | bound | when full |
 //! | --- | --- | --- |
 //! | `frames`, a camera's mailbox | 1 live, 8 offline | live: the older frame is dropped (`overload`); offline: the decoder waits |
-//! | the detector, all live cameras together | what its workers take, and one worker's next ([`turns`]) | the frame waits in its mailbox |
+//! | the detector, all live cameras together | what its workers take, and one worker's next (`turns.rs`) | the frame waits in its mailbox |
 //! | `detected`, detect to embed | 2 a camera | the stage before waits |
 //! | from the mailbox to the tracks | the detector's workers and 2, live; offline four times as many | the frame waits in its mailbox |
 //! | `link`, pairs to be scored | 1 a camera | cannot be: a camera has one frame in hand |

@@ -1,8 +1,14 @@
 //! `gakp bench`: speed beside its limit, and beside a peer doing the same job, in one run.
 
+#[cfg(all(feature = "service", feature = "testcam"))]
+mod cameras;
 mod core;
 mod crowd;
 mod pipeline;
+#[cfg(all(feature = "service", feature = "testcam"))]
+mod scrape;
+#[cfg(all(feature = "service", feature = "testcam"))]
+mod served;
 
 use std::process::Command;
 
@@ -22,6 +28,9 @@ enum What {
     Pipeline(pipeline::Args),
     /// The tracker alone on detections from files, one thread, by part, and against peers.
     Core(core::Args),
+    /// The live service with more and more cameras, against the models alone.
+    #[cfg(all(feature = "service", feature = "testcam"))]
+    Cameras(cameras::Args),
 }
 
 /// Runs the command.
@@ -32,6 +41,8 @@ pub fn run(args: Args) -> Result<()> {
     match args.what {
         What::Pipeline(args) => pipeline::run(args),
         What::Core(args) => core::run(args),
+        #[cfg(all(feature = "service", feature = "testcam"))]
+        What::Cameras(args) => cameras::run(args),
     }
 }
 

@@ -109,7 +109,7 @@ pub fn run(args: Args) -> Result<()> {
 }
 
 /// Every frame of the video, in order.
-fn decode(video: &str) -> Result<Vec<(Image, MediaTime)>> {
+pub(super) fn decode(video: &str) -> Result<Vec<(Image, MediaTime)>> {
     let mut spec = SourceSpec::parse(video)?;
     ensure!(!spec.retries(), "{}: give a video file, not a camera", spec.url.redacted());
     spec.pacing = Pacing::AsFastAsPossible;
@@ -139,7 +139,7 @@ fn decode(video: &str) -> Result<Vec<(Image, MediaTime)>> {
 }
 
 /// What the models are asked about each frame: the boxes that are detected, the pairs that are gated.
-fn frame_work(frames: &[(Image, MediaTime)], settings: &ModelSettings) -> Result<Vec<FrameWork>> {
+pub(super) fn frame_work(frames: &[(Image, MediaTime)], settings: &ModelSettings) -> Result<Vec<FrameWork>> {
     let models = Models::load(settings, Arc::new(()))?;
     let linker = models.linker.clone().context("tracking needs a link scorer: set --link to one")?;
     let mut tracker = Tracker::new(models.calibrate(TrackerConfig::default()));
