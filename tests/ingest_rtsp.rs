@@ -225,6 +225,32 @@ fn a_wrong_path_and_a_refused_port_are_told_apart() {
     }
 }
 
+/// As the channels of a recorder: behind one address, one of them not there.
+#[test]
+fn a_wrong_path_costs_no_other_camera_of_the_same_server() {
+    let clip = Clip::numbered(50, 25.0);
+    let camera = TestCamera::start(TestCameraConfig::new(clip.path())).unwrap();
+    let astray = format!("rtsp://{}/other", camera.address());
+    for _ in 0..6 {
+        let start = |url: &str| [(); 3].map(|()| Live::start(spec(url, Transport::Tcp)));
+        let (mut healthy, astray) = (start(&camera.url()), start(&astray));
+        for mut live in astray {
+            assert_eq!(live.wait_lost().0, Failure::NotFound);
+            live.stop();
+        }
+        for live in &mut healthy {
+            for _ in 0..10 {
+                live.wait("frame", |event| match event {
+                    SourceEvent::Frame(_) => Some(()),
+                    SourceEvent::Lost { reason, .. } => panic!("{reason}"),
+                    _ => None,
+                });
+            }
+        }
+        healthy.into_iter().for_each(Live::stop);
+    }
+}
+
 #[test]
 fn a_camera_that_dies_and_comes_back_is_seen_again() {
     let clip = Clip::numbered(100, 25.0);

@@ -318,10 +318,10 @@ impl<S: FnMut(SourceEvent) -> ControlFlow<()>> Source<S> {
             memory::give_back();
         });
         let mut in_time = closes.is_err() || closed.recv_timeout(CLOSING).is_ok();
-        if let Some(line) = line {
+        if let (false, Some(line)) = (in_time, line) {
             line.cut();
+            in_time = closed.recv_timeout(CLOSING).is_ok();
         }
-        in_time = in_time || closed.recv_timeout(CLOSING).is_ok();
         if !in_time {
             warn!(camera = %self.camera, "a connection does not close although it was cut; it is left behind");
             self.closing.push(closed);
