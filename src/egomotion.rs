@@ -47,6 +47,28 @@ struct Grey {
     pixels: Vec<i16>,
 }
 
+/// Means of cells of so many pixels, in units of 1 / [`UNIT`].
+struct Mean {
+    /// 2^48 times a unit's part of the sum, rounded up. Sums are below 2^26, so that nothing but the fraction is wrong.
+    factor: u64,
+}
+
+impl Mean {
+    /// Of `scale` x `scale` pixels, `scale` at most 256.
+    fn of(scale: usize) -> Self {
+        Self { factor: (u64::from(UNIT) << 48).div_ceil((scale * scale) as u64) }
+    }
+
+    fn of_cell(&self, columns: &[u16]) -> i16 {
+        let sum: u32 = columns.iter().map(|v| u32::from(*v)).sum();
+        ((u64::from(sum) * self.factor) >> 48) as i16
+    }
+
+    fn of_cells<const SCALE: usize>(&self, columns: &[u16]) -> impl Iterator<Item = i16> {
+        columns.as_chunks::<SCALE>().0.iter().map(|cell| self.of_cell(cell))
+    }
+}
+
 impl Grey {
     /// Means of `scale` x `scale` pixels of luma.
     fn of(image: &Image, scale: usize) -> Self {
@@ -55,23 +77,31 @@ impl Grey {
         // Columns of a row of cells; 255 times a scale of up to 257 fits.
         let mut columns = vec![0u16; width * scale];
         let mut pixels = Vec::with_capacity(width * height);
+        let mean = Mean::of(scale);
         for y in 0..height {
             columns.fill(0);
             for row in plane[y * scale * stride..].chunks(stride).take(scale) {
                 columns.iter_mut().zip(row).for_each(|(sum, v)| *sum += u16::from(*v));
             }
-            let area = (scale * scale) as u32;
-            let mean = |cell: &[u16]| cell.iter().map(|v| u32::from(*v)).sum::<u32>() * UNIT / area;
-            pixels.extend(columns.chunks_exact(scale).map(|cell| mean(cell) as i16));
+            match scale {
+                // The widths of most cameras, 640 to 1280: the compiler makes additions of these.
+                4 => pixels.extend(mean.of_cells::<4>(&columns)),
+                8 => pixels.extend(mean.of_cells::<8>(&columns)),
+                12 => pixels.extend(mean.of_cells::<12>(&columns)),
+                _ => pixels.extend(columns.chunks_exact(scale).map(|cell| mean.of_cell(cell))),
+            }
         }
         Self { width, height, pixels }
     }
 
     fn halved(&self) -> Self {
         let (width, height) = (self.width / 2, self.height / 2);
-        let at = |x: usize, y: usize| self.pixels[y * self.width + x];
-        let cell = |x: usize, y: usize| at(x, y) + at(x + 1, y) + at(x, y + 1) + at(x + 1, y + 1);
-        let pixels = (0..width * height).map(|i| cell(i % width * 2, i / width * 2) / 4).collect();
+        let mut pixels = Vec::with_capacity(width * height);
+        for rows in self.pixels.chunks_exact((2 * self.width).max(1)).take(height) {
+            let (upper, lower) = rows.split_at(self.width);
+            let (upper, lower) = (upper.as_chunks::<2>().0, lower.as_chunks::<2>().0);
+            pixels.extend(upper.iter().zip(lower).map(|([a, b], [c, d])| (a + b + c + d) / 4));
+        }
         Self { width, height, pixels }
     }
 
@@ -99,13 +129,18 @@ impl Grey {
         squares as f32 - (sum as f32).powi(2) / (SIDE * SIDE) as f32
     }
 
-    /// Mean absolute deviation within a block, levels of luma.
-    fn texture(&self, (x, y): (usize, usize), side: usize) -> f32 {
-        let rows = || (y..y + side).flat_map(|y| &self.pixels[y * self.width + x..y * self.width + x + side]);
-        let area = (side * side) as i32;
-        let mean = rows().map(|v| i32::from(*v)).sum::<i32>() / area;
-        let deviation = rows().map(|v| (i32::from(*v) - mean).abs()).sum::<i32>();
-        deviation as f32 / area as f32 / UNIT as f32
+    /// Whether the mean absolute deviation within the block of `SIDE` at `(x, y)` is [`TEXTURE`] at least.
+    fn has_texture<const SIDE: usize>(&self, (x, y): (usize, usize)) -> bool {
+        let rows = || {
+            let lines = self.pixels[y * self.width + x..].chunks(self.width).take(SIDE);
+            lines.filter_map(|line| line.first_chunk::<SIDE>())
+        };
+        let area = (SIDE * SIDE) as i32;
+        let sum = |row: &[i16; SIDE]| row.iter().map(|v| i32::from(*v)).sum::<i32>();
+        let mean = (rows().map(sum).sum::<i32>() / area) as i16;
+        let apart = |row: &[i16; SIDE]| row.iter().map(|v| i32::from((v - mean).abs())).sum::<i32>();
+        let deviation = rows().map(apart).sum::<i32>();
+        deviation as f32 / area as f32 / UNIT as f32 >= TEXTURE
     }
 
     /// Sum of squared differences to the block of `side` that lies by `(dx, dy)` from `at` in `later`; `None`
@@ -216,18 +251,18 @@ impl Egomotion {
     }
 }
 
-/// Corners of the blocks of `side`, one every `step`, that have texture.
-fn blocks(grey: &Grey, side: usize, step: usize) -> Vec<(usize, usize)> {
-    let corners = |length: usize| (0..(length + 1).saturating_sub(side)).step_by(step);
+/// Corners of the blocks of `SIDE`, one every `step`, that have texture.
+fn blocks<const SIDE: usize>(grey: &Grey, step: usize) -> Vec<(usize, usize)> {
+    let corners = |length: usize| (0..(length + 1).saturating_sub(SIDE)).step_by(step);
     let all = corners(grey.height).flat_map(|y| corners(grey.width).map(move |x| (x, y)));
-    all.filter(|at| grey.texture(*at, side) >= TEXTURE).collect()
+    all.filter(|at| grey.has_texture::<SIDE>(*at)).collect()
 }
 
 /// Displacements of the blocks with texture, pixels of the small picture. Each level says about where to look
 /// in the next finer one.
 fn displacements(before: &[Grey; 3], now: &[Grey; 3]) -> Vec<[f32; 2]> {
     let search = |level: usize, step: usize, guess: [isize; 2], reach: isize| -> Option<[isize; 2]> {
-        let found = blocks(&before[level], BLOCK, step)
+        let found = blocks::<BLOCK>(&before[level], step)
             .into_iter()
             .filter_map(|at| before[level].find::<BLOCK>(at, &now[level], guess, reach))
             .map(|by| by.map(|v| v as f32));
@@ -238,7 +273,7 @@ fn displacements(before: &[Grey; 3], now: &[Grey; 3]) -> Vec<[f32; 2]> {
         let mean = |axis: usize| inside.iter().map(|by| by[axis]).sum::<f32>() / inside.len() as f32;
         Some([0, 1].map(|axis| (2.0 * mean(axis)).round() as isize))
     };
-    let all = blocks(&before[1], BLOCK, BLOCK);
+    let all = blocks::<BLOCK>(&before[1], BLOCK);
     let staying = all.iter().filter(|at| before[1].stays::<BLOCK>(**at, &now[1])).count();
     let guess = if 2 * staying > all.len() {
         // A camera that stands still, or hardly moves: nothing has to be looked for.
@@ -248,7 +283,7 @@ fn displacements(before: &[Grey; 3], now: &[Grey; 3]) -> Vec<[f32; 2]> {
     };
     let Some(guess) = guess else { return vec![] };
     const SIDE: usize = 2 * BLOCK;
-    let moves = blocks(&before[0], SIDE, SIDE).into_iter();
+    let moves = blocks::<SIDE>(&before[0], SIDE).into_iter();
     moves.filter_map(|at| before[0].refine::<SIDE>(at, &now[0], guess)).collect()
 }
 
@@ -339,6 +374,19 @@ mod tests {
             let still = dx == 0.0 && dy == 0.0;
             assert_eq!(still, found == Shift::default(), "{found:?}");
             assert!(still || found.variance.iter().all(|v| *v > 0.0 && *v < 1.0), "{found:?}");
+        }
+    }
+
+    #[test]
+    fn means_are_those_of_a_division() {
+        for scale in [1, 2, 3, 4, 7, 8, 12, 24, 100, 256] {
+            let (mean, area) = (Mean::of(scale), (scale * scale) as u32);
+            for sum in (0..=255 * area).step_by(area.div_ceil(97) as usize).chain([255 * area, area - 1]) {
+                // Spread over columns, whichever way.
+                let mut columns = vec![(sum / scale as u32) as u16; scale];
+                columns[0] += (sum % scale as u32) as u16;
+                assert_eq!(mean.of_cell(&columns), (sum * UNIT / area) as i16, "{sum} / {area}");
+            }
         }
     }
 
