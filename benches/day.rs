@@ -219,7 +219,10 @@ fn main() {
     let took = started.elapsed();
     println!("{hours} hours in {:.0} s; no id was used twice", took.as_secs_f64());
     if looks.len() > 1 {
-        println!("slope of the memory in use after {WARM_UP} hours: {:.3} MB an hour", vitals::slope(&looks));
+        let (slope, error) = vitals::slope(&looks);
+        println!(
+            "slope of the memory in use after {WARM_UP} hours: {slope:.3} MB an hour, standard error {error:.3}"
+        );
     }
     let missed = history.metrics().missed_reports.get();
     println!(

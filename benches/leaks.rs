@@ -112,7 +112,9 @@ impl Bench {
         }
         let (first, last) = (looks[0].1, looks[STEPS].1);
         let points: Vec<_> = looks.iter().map(|(count, vitals)| (*count as f64, vitals.resident)).collect();
-        println!("slope of the memory: {:.2} MB a thousand (limit 1)", 1000.0 * vitals::slope(&points));
+        let (slope, error) = vitals::slope(&points);
+        let [slope, error] = [slope, error].map(|v| 1000.0 * v);
+        println!("slope of the memory: {slope:.2} MB a thousand, standard error {error:.2} (limit 1)");
         println!(
             "threads {} -> {}, descriptors {} -> {} (limit: the same)",
             first.threads, last.threads, first.descriptors, last.descriptors

@@ -2,15 +2,16 @@
 
 #[cfg(feature = "service")]
 pub mod ablate;
-#[cfg(feature = "service")]
+#[cfg(feature = "infer")]
 pub mod bench;
 #[cfg(feature = "testcam")]
 pub mod camera;
 #[cfg(feature = "service")]
 pub mod check;
 pub mod eval;
+#[cfg_attr(not(feature = "service"), allow(dead_code, reason = "only the service changes its level"))]
 mod log;
-#[cfg(feature = "service")]
+#[cfg(feature = "infer")]
 mod models;
 #[cfg(feature = "service")]
 mod reload;
@@ -70,8 +71,8 @@ pub enum Command {
     #[cfg(feature = "testcam")]
     Camera(camera::Args),
     /// Measure speed beside its limit.
-    #[cfg(feature = "service")]
-    Bench(bench::Args),
+    #[cfg(feature = "infer")]
+    Bench(Box<bench::Args>),
     /// Write a simulated world of pedestrians as MOTChallenge sequences.
     Simulate(simulate::Args),
     /// Cut MOTChallenge sequences in halves, to train on one and test on the other.
@@ -104,8 +105,8 @@ pub fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Ablate(args) => ablate::run(args),
         #[cfg(feature = "testcam")]
         Command::Camera(args) => camera::run(args),
-        #[cfg(feature = "service")]
-        Command::Bench(args) => bench::run(args),
+        #[cfg(feature = "infer")]
+        Command::Bench(args) => bench::run(*args),
         Command::Simulate(args) => simulate::run(args),
         Command::Split(args) => split::run(args),
         #[cfg(feature = "learn")]

@@ -1,9 +1,10 @@
 //! Arguments about models, shared by the commands that run them.
 
+#[cfg(all(feature = "service", feature = "testcam"))]
 use std::ffi::OsString;
 use std::path::PathBuf;
 
-use crate::config::ModelConfig;
+use crate::infer::ModelConfig;
 
 /// Models and where they run.
 #[derive(Clone, Debug, Default, clap::Args)]
@@ -60,6 +61,7 @@ impl From<ModelArgs> for ModelConfig {
 
 impl ModelArgs {
     /// As they are written, for another process.
+    #[cfg(all(feature = "service", feature = "testcam"))]
     pub fn to_args(&self) -> Vec<OsString> {
         let path = |path: &Option<PathBuf>| path.clone().map(OsString::from);
         let text = |text: &Option<String>| text.clone().map(OsString::from);
@@ -81,7 +83,7 @@ impl ModelArgs {
     }
 }
 
-fn size(text: &str) -> Result<(usize, usize), String> {
+pub fn size(text: &str) -> Result<(usize, usize), String> {
     let parsed = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     parsed.ok_or_else(|| format!("{text:?} is no size: write WIDTHxHEIGHT, such as 352x288"))
 }

@@ -49,7 +49,7 @@ impl Detector {
         arrangement: Arrangement,
         observer: Arc<dyn Observer>,
     ) -> Result<Self, InferError> {
-        let spec = Arc::new(DetectSpec::new(entry, settings)?);
+        let spec = Arc::new(DetectSpec::new(entry, settings, runtime.provider)?);
         let (runtime, entry, file) = (runtime.clone(), entry.clone(), file.to_path_buf());
         let build = {
             let spec = spec.clone();

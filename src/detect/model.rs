@@ -9,8 +9,8 @@ use super::letterbox::Letterbox;
 use super::nms::{Candidate, suppress};
 use super::{DetectorSettings, grey};
 use crate::infer::{
-    Arrangement, BatchModel, InferError, InputSpec, ModelEntry, Normalisation, PictureGraph, Rasteriser,
-    Runtime,
+    Arrangement, BatchModel, InferError, InputSpec, ModelEntry, Normalisation, PictureGraph, Placement,
+    Provider, Rasteriser, Runtime,
 };
 use crate::types::{BBox, ClassId, Detection, Image};
 
@@ -29,7 +29,11 @@ pub(crate) struct DetectSpec {
 }
 
 impl DetectSpec {
-    pub(crate) fn new(entry: &ModelEntry, settings: &DetectorSettings) -> Result<Self, InferError> {
+    pub(crate) fn new(
+        entry: &ModelEntry,
+        settings: &DetectorSettings,
+        provider: Provider,
+    ) -> Result<Self, InferError> {
         let wrong = |setting, reason: String| InferError::Setting { setting, reason };
         let (Some(input), Some(output)) = (&entry.input, &entry.output) else {
             return Err(InferError::Graph { name: entry.name.clone(), reason: "it is no detector".into() });
@@ -69,7 +73,8 @@ impl DetectSpec {
         Ok(Self {
             input: input.clone(),
             size,
-            shrink: dynamic,
+            // An engine of TensorRT is built for one size, for minutes.
+            shrink: dynamic && provider != Provider::TensorRt,
             decoder: Decoder {
                 family: entry.family,
                 strides: output.strides.clone(),
@@ -94,9 +99,6 @@ pub(crate) struct DetectModel {
     spec: Arc<DetectSpec>,
     normalisation: Normalisation,
     rasteriser: Rasteriser,
-    /// Pictures that one call of the graph may hold.
-    most: usize,
-    tensor: Vec<f32>,
     candidates: Vec<Candidate>,
     last: Duration,
 }
@@ -109,77 +111,58 @@ impl DetectModel {
         arrangement: Arrangement,
         spec: Arc<DetectSpec>,
     ) -> Result<Self, InferError> {
-        let graph = PictureGraph::load(runtime, entry, file, arrangement, spec.size)?;
+        let graph = PictureGraph::load(runtime, entry, file, arrangement.max_batch, spec.size)?;
         Ok(Self {
             graph,
             normalisation: Normalisation::new(&spec.input),
             rasteriser: Rasteriser::new(),
-            most: spec.input.shape[0].fixed().unwrap_or(arrangement.max_batch).max(1),
             spec,
-            tensor: vec![],
             candidates: vec![],
             last: Duration::ZERO,
         })
     }
 
-    /// Runs once, so that the first frame does not pay for what is made lazily and a graph that gives
+    /// Runs what will be run, so that the first frame does not pay for what is made lazily and a graph that gives
     /// another shape than its family's is found now.
     pub(crate) fn warm_up(&mut self) -> Result<(), InferError> {
         let (width, height) = self.spec.size;
+        self.graph.warm_up(self.spec.size)?;
         self.run(&[grey(width as u32, height as u32)]).map(drop)
     }
 
-    /// Writes a frame's tensor; where it lies in it.
-    pub(super) fn prepare(&mut self, image: &Image, at: usize) -> Letterbox {
-        let letterbox = self.spec.letterbox(image);
-        let length = 3 * letterbox.place.width * letterbox.place.height;
-        if self.tensor.len() < (at + 1) * length {
-            self.tensor.resize((at + 1) * length, 0.0);
-        }
-        let whole = BBox::new(0.0, 0.0, image.width.into(), image.height.into());
-        let tensor = &mut self.tensor[at * length..(at + 1) * length];
-        self.rasteriser.write(image, whole, letterbox.place, &self.normalisation, tensor);
-        letterbox
+    /// Writes `batch` copies of a frame into the network's input.
+    pub(crate) fn prepare(&mut self, image: &Image, batch: usize) -> Result<(), InferError> {
+        self.write(&vec![image; batch.min(self.graph.most())]).map(drop)
     }
 
-    /// A tensor that holds `batch` copies of a frame, and its shape.
-    pub(crate) fn tensor(&mut self, image: &Image, batch: usize) -> ([usize; 4], Vec<f32>) {
-        let batch = self.spec.input.shape[0].fixed().unwrap_or(batch.min(self.most));
-        let mut shape = [batch, 3, 0, 0];
-        for at in 0..batch {
-            let place = self.prepare(image, at).place;
-            (shape[2], shape[3]) = (place.height, place.width);
-        }
-        (shape, self.tensor[..shape.iter().product()].to_vec())
+    /// Runs the network alone, on what lies in its input.
+    pub(crate) fn run_network(&mut self) -> Result<(), InferError> {
+        self.graph.run(|_, _| Ok(()))
     }
 
-    /// Runs the network alone.
-    pub(crate) fn run_tensor(&mut self, shape: [usize; 4], tensor: &[f32]) -> Result<(), InferError> {
-        self.graph.run(shape, tensor, |_, _| Ok(()))
+    /// Writes frames whose tensors have one shape; where each lies in its tensor.
+    fn write(&mut self, images: &[&Image]) -> Result<Vec<Letterbox>, InferError> {
+        let letterboxes: Vec<Letterbox> = images.iter().map(|image| self.spec.letterbox(image)).collect();
+        let Placement { width, height, .. } = letterboxes[0].place;
+        let input = self.graph.input(images.len(), (width, height))?;
+        let tensors = input.chunks_exact_mut(3 * width * height);
+        for ((image, letterbox), tensor) in images.iter().zip(&letterboxes).zip(tensors) {
+            let whole = BBox::new(0.0, 0.0, image.width.into(), image.height.into());
+            self.rasteriser.write(image, whole, letterbox.place, &self.normalisation, tensor);
+        }
+        Ok(letterboxes)
     }
 
     /// Runs frames whose tensors have one shape.
     fn run_alike(&mut self, images: &[&Image]) -> Result<Vec<Vec<Detection>>, InferError> {
-        let letterboxes: Vec<Letterbox> =
-            images.iter().enumerate().map(|(at, image)| self.prepare(image, at)).collect();
-        let (width, height) = (letterboxes[0].place.width, letterboxes[0].place.height);
+        let letterboxes = self.write(images)?;
+        let Placement { width, height, .. } = letterboxes[0].place;
         let (spec, candidates) = (&self.spec, &mut self.candidates);
-        // A graph of a fixed batch is filled up with what the tensor held before.
-        let filled = spec.input.shape[0].fixed().unwrap_or(images.len());
-        let shape = [filled, 3, height, width];
-        let length = shape.iter().product();
-        if self.tensor.len() < length {
-            self.tensor.resize(length, 0.0);
-        }
-        let tensor = &self.tensor[..length];
-        self.graph.run(shape, tensor, |axes, output| {
-            let &[batch, rows, columns] = axes else {
+        self.graph.run(|axes, output| {
+            let &[_, rows, columns] = axes else {
                 return Err(format!("the output has the shape {axes:?}, three axes are expected"));
             };
             let (rows, columns) = (rows as usize, columns as usize);
-            if batch as usize != filled {
-                return Err(format!("{batch} outputs for {filled} frames"));
-            }
             let mut answers = Vec::with_capacity(images.len());
             for (index, letterbox) in letterboxes.iter().enumerate() {
                 let output = &output[index * rows * columns..][..rows * columns];
@@ -216,7 +199,7 @@ impl BatchModel for DetectModel {
         order.sort_by_key(|&index| sizes[index]);
         let mut answers = vec![vec![]; jobs.len()];
         for alike in order.chunk_by(|&a, &b| sizes[a] == sizes[b]) {
-            for some in alike.chunks(self.most) {
+            for some in alike.chunks(self.graph.most()) {
                 let images: Vec<&Image> = some.iter().map(|&index| &jobs[index]).collect();
                 for (&index, found) in some.iter().zip(self.run_alike(&images)?) {
                     answers[index] = found;
@@ -303,7 +286,8 @@ mod tests {
         // As many as one call may hold; a file that takes two at a time.
         for (batch, max_batch) in [(Dim::Dynamic("batch".into()), 4), (Dim::Fixed(2), 16)] {
             let entry = entry(batch);
-            let spec = Arc::new(DetectSpec::new(&entry, &DetectorSettings::default()).expect("a detector"));
+            let spec = DetectSpec::new(&entry, &DetectorSettings::default(), runtime.provider);
+            let spec = Arc::new(spec.expect("a detector"));
             let arrangement = Arrangement { workers: 1, max_batch, max_wait: Duration::ZERO, capacity: 1 };
             let file = fixture("yolox.onnx");
             let mut model = DetectModel::load(&runtime, &entry, &file, arrangement, spec).expect("the graph");

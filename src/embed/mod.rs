@@ -52,7 +52,7 @@ impl Embedder {
         let width = entry.output.as_ref().and_then(|output| output.width).unwrap_or(0);
         let (runtime, entry, file) = (runtime.clone(), entry.clone(), file.to_path_buf());
         let build = move |_| {
-            let mut model = NetworkModel::load(&runtime, &entry, &file, arrangement)?;
+            let mut model = NetworkModel::load(&runtime, &entry, &file)?;
             model.warm_up()?;
             Ok(EmbedModel::Network(Box::new(model)))
         };

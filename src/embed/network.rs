@@ -5,8 +5,7 @@ use std::time::Duration;
 
 use super::EmbedJob;
 use crate::infer::{
-    Arrangement, InferError, InputSpec, ModelEntry, Normalisation, PictureGraph, Placement, Rasteriser,
-    Runtime,
+    InferError, InputSpec, ModelEntry, Normalisation, PictureGraph, Placement, Rasteriser, Runtime,
 };
 use crate::types::{BBox, Embedding, Image};
 
@@ -20,38 +19,30 @@ pub(crate) struct NetworkModel {
     normalisation: Normalisation,
     rasteriser: Rasteriser,
     width: usize,
-    most: usize,
-    tensor: Vec<f32>,
     last: Duration,
 }
 
 impl NetworkModel {
-    pub(crate) fn load(
-        runtime: &Runtime,
-        entry: &ModelEntry,
-        file: &Path,
-        arrangement: Arrangement,
-    ) -> Result<Self, InferError> {
+    pub(crate) fn load(runtime: &Runtime, entry: &ModelEntry, file: &Path) -> Result<Self, InferError> {
         let (Some(input), Some(width)) = (&entry.input, entry.output.as_ref().and_then(|o| o.width)) else {
             return Err(InferError::Graph {
                 name: entry.name.clone(),
                 reason: "it is no ReID network".into(),
             });
         };
-        let graph = PictureGraph::load(runtime, entry, file, arrangement, (input.width, input.height))?;
+        let graph = PictureGraph::load(runtime, entry, file, MOST, (input.width, input.height))?;
         Ok(Self {
             graph,
             normalisation: Normalisation::new(input),
             rasteriser: Rasteriser::new(),
             width,
-            most: input.shape[0].fixed().unwrap_or(MOST).clamp(1, MOST),
             input: input.clone(),
-            tensor: vec![],
             last: Duration::ZERO,
         })
     }
 
     pub(crate) fn warm_up(&mut self) -> Result<(), InferError> {
+        self.graph.warm_up((self.input.width, self.input.height))?;
         let image = crate::detect::grey(self.input.width as u32, self.input.height as u32);
         let boxes = vec![BBox::new(0.0, 0.0, image.width.into(), image.height.into())];
         self.run(&[EmbedJob { image, boxes }]).map(drop)
@@ -62,7 +53,7 @@ impl NetworkModel {
         let crops: Vec<(&Image, BBox)> =
             jobs.iter().flat_map(|job| job.boxes.iter().map(|bbox| (&job.image, *bbox))).collect();
         let mut all = Vec::with_capacity(crops.len());
-        for some in crops.chunks(self.most) {
+        for some in crops.chunks(self.graph.most()) {
             self.run_crops(some, &mut all)?;
         }
         self.last = self.graph.take_time();
@@ -80,20 +71,15 @@ impl NetworkModel {
         all: &mut Vec<Option<Embedding>>,
     ) -> Result<(), InferError> {
         let (w, h) = (self.input.width, self.input.height);
-        let length = 3 * w * h;
-        // A graph of a fixed batch is filled up with what the tensor held before.
-        let batch = self.input.shape[0].fixed().unwrap_or(crops.len());
-        if self.tensor.len() < batch * length {
-            self.tensor.resize(batch * length, 0.0);
-        }
         let place = Placement { width: w, height: h, x: 0, y: 0, w, h };
-        for ((image, bbox), tensor) in crops.iter().zip(self.tensor.chunks_exact_mut(length)) {
+        let tensors = self.graph.input(crops.len(), (w, h))?.chunks_exact_mut(3 * w * h);
+        for ((image, bbox), tensor) in crops.iter().zip(tensors) {
             self.rasteriser.write(image, *bbox, place, &self.normalisation, tensor);
         }
         let width = self.width;
-        self.graph.run([batch, 3, h, w], &self.tensor[..batch * length], |axes, output| {
-            if axes != [batch as i64, width as i64] {
-                return Err(format!("the output has the shape {axes:?}, [{batch}, {width}] is expected"));
+        self.graph.run(|axes, output| {
+            if axes[1..] != [width as i64] {
+                return Err(format!("the output has the shape {axes:?}, [batch, {width}] is expected"));
             }
             all.extend(
                 output.chunks_exact(width).take(crops.len()).map(|v| Embedding::normalised(v.to_vec())),

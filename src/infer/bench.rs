@@ -1,5 +1,6 @@
 //! How fast the models are alone: no queue, no decoding of video, no pre-processing of frames.
 
+use std::cell::Cell;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Barrier};
 use std::thread;
@@ -51,9 +52,19 @@ impl AloneReport {
     }
 }
 
-/// Tensors that are prepared beforehand; a network takes the same time whatever is in the picture, so
-/// they are used in turn.
-const PREPARED: usize = 16;
+/// [`models_alone`] at a camera's pace: a frame in every `interval`, on one thread. In between, others use the caches and
+/// the core sleeps, so that a frame takes longer than one of many.
+///
+/// # Errors
+/// As [`models_alone`].
+pub fn models_at_pace(
+    settings: &ModelSettings,
+    work: &[FrameWork],
+    frames: usize,
+    interval: Duration,
+) -> Result<AloneReport, InferError> {
+    run_alone(&ModelSettings { threads: Some(1), ..settings.clone() }, work, frames, Some(interval))
+}
 
 /// Runs `frames` frames, taken from `work` in turn, through the detector, the appearance model and the
 /// link scorer of `settings`, one after the other on each of the threads that the provider's
@@ -66,13 +77,22 @@ pub fn models_alone(
     work: &[FrameWork],
     frames: usize,
 ) -> Result<AloneReport, InferError> {
+    run_alone(settings, work, frames, None)
+}
+
+fn run_alone(
+    settings: &ModelSettings,
+    work: &[FrameWork],
+    frames: usize,
+    pace: Option<Duration>,
+) -> Result<AloneReport, InferError> {
     if work.is_empty() || frames == 0 {
         return Err(InferError::Setting { setting: "bench", reason: "no frames to run".into() });
     }
     let plan = Plan::new(settings)?;
     let arrangement = plan.runtime.provider.arrangement(Task::Detect, settings.threads);
     let Arrangement { workers: threads, max_batch: batch, .. } = arrangement;
-    let spec = Arc::new(DetectSpec::new(&plan.detector.entry, &settings.detection)?);
+    let spec = Arc::new(DetectSpec::new(&plan.detector.entry, &settings.detection, plan.runtime.provider)?);
     let barrier = Barrier::new(threads + 1);
     // Whoever is free takes the next frames: a thread that the machine holds up does not stand for all.
     let next = AtomicUsize::new(0);
@@ -81,10 +101,10 @@ pub fn models_alone(
             .map(|index| {
                 let (plan, spec, barrier, next) = (&plan, &spec, &barrier, &next);
                 let run = move || {
-                    let instance = Instance::load(plan, spec, settings, arrangement, work);
+                    let instance = Instance::load(plan, spec, arrangement, work);
                     // Everybody arrives, or nobody would ever start.
                     barrier.wait();
-                    instance?.run(work, next, frames, batch)
+                    instance?.run(work, next, frames, batch, pace)
                 };
                 thread::Builder::new()
                     .name(format!("bench-{index}"))
@@ -156,7 +176,6 @@ impl LinkAlone {
 /// One thread's models.
 struct Instance {
     detector: DetectModel,
-    tensors: Vec<([usize; 4], Vec<f32>)>,
     reid: Option<EmbedModel>,
     link: Option<LinkModel>,
 }
@@ -165,7 +184,6 @@ impl Instance {
     fn load(
         plan: &Plan,
         spec: &Arc<DetectSpec>,
-        settings: &ModelSettings,
         arrangement: Arrangement,
         work: &[FrameWork],
     ) -> Result<Self, InferError> {
@@ -173,15 +191,14 @@ impl Instance {
         let Chosen { entry, file } = &plan.detector;
         let mut detector = DetectModel::load(runtime, entry, file, arrangement, spec.clone())?;
         detector.warm_up()?;
-        let frames = work.iter().take(PREPARED);
-        let tensors = frames.map(|work| detector.tensor(&work.image, arrangement.max_batch)).collect();
+        // A network takes the same time whatever is in the picture.
+        detector.prepare(&work[0].image, arrangement.max_batch)?;
         let reid = match &plan.reid {
             Reid::None => None,
             Reid::Stripes => Some(EmbedModel::Stripes(Box::default())),
             Reid::Network(network) => {
                 let Chosen { entry, file } = &**network;
-                let arrangement = runtime.provider.arrangement(Task::Reid, settings.threads);
-                let mut network = NetworkModel::load(runtime, entry, file, arrangement)?;
+                let mut network = NetworkModel::load(runtime, entry, file)?;
                 network.warm_up()?;
                 Some(EmbedModel::Network(Box::new(network)))
             }
@@ -190,7 +207,7 @@ impl Instance {
             None => None,
             Some(Chosen { entry, file }) => Some(LinkModel::load(runtime, &entry.name, file)?),
         };
-        Ok(Self { detector, tensors, reid, link })
+        Ok(Self { detector, reid, link })
     }
 
     /// Runs frames until none is left. When it began and ended, and the time in the detector, the
@@ -201,22 +218,26 @@ impl Instance {
         next: &AtomicUsize,
         frames: usize,
         batch: usize,
+        pace: Option<Duration>,
     ) -> Result<Span, InferError> {
         let mut spent = [Duration::ZERO; 3];
         let start = Instant::now();
-        let mut clock = start;
-        let mut lap = |spent: &mut Duration| {
+        let clock = Cell::new(start);
+        let lap = |spent: &mut Duration| {
             let now = Instant::now();
-            *spent += now - clock;
-            clock = now;
+            *spent += now - clock.replace(now);
         };
         loop {
             let first = next.fetch_add(batch, Ordering::Relaxed);
             if first >= frames {
                 break;
             }
-            let (shape, tensor) = &self.tensors[first / batch % self.tensors.len()];
-            self.detector.run_tensor(*shape, tensor)?;
+            if let Some(interval) = pace {
+                let due = start + interval * (first as u32);
+                thread::sleep(due.saturating_duration_since(Instant::now()));
+                clock.set(Instant::now());
+            }
+            self.detector.run_network()?;
             lap(&mut spent[0]);
             for at in first..frames.min(first + batch) {
                 let FrameWork { image, boxes, link } = &work[at % work.len()];
@@ -236,7 +257,7 @@ impl Instance {
                 lap(&mut spent[2]);
             }
         }
-        Ok((start, clock, spent))
+        Ok((start, clock.get(), spent))
     }
 }
 

@@ -9,6 +9,7 @@
 //!
 //! Requests of several cameras are joined by concatenation; `pair_track` moves by the tracks before it.
 
+use std::iter::successors;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
@@ -19,7 +20,7 @@ use ort::value::{TensorElementType, TensorRef};
 use super::graph::check_type;
 use super::manifest::{Family, ModelEntry};
 use super::runtime::Runtime;
-use super::{Arrangement, BatchModel, Batcher, InferError, Observer, Task};
+use super::{Arrangement, BatchModel, Batcher, InferError, Observer, Provider, Task};
 use crate::track::{Association, ExistenceHead, Features, HISTORY, LinkRequest, TrackerConfig};
 use crate::tuning::FilterTuning;
 
@@ -31,6 +32,8 @@ const INPUTS: [(&str, TensorElementType); 4] = [
     ("pair_track", TensorElementType::Int64),
 ];
 const OUTPUT: &str = "probability";
+/// Tracks and pairs of the largest request that is run beforehand, where requests are filled up.
+const WARM: usize = 1024;
 /// Metadata that names the features.
 const FEATURES: &str = "features";
 /// Metadata that holds the existence head.
@@ -57,6 +60,11 @@ impl Surroundings {
             existence: existence.map_err(|e| format!("its existence head is broken: {e}"))?.map(Arc::new),
             filter: filter.map_err(|e| format!("its filter is broken: {e}"))?.unwrap_or_default(),
         })
+    }
+
+    /// What the network reads.
+    pub(super) fn features(&self) -> Features {
+        self.features
     }
 
     /// `tracker` with the network's features, and its filter and existence head where it has them.
@@ -92,7 +100,7 @@ impl Linker {
         let batcher = Batcher::start(MODEL, arrangement, observer, move |_| {
             let mut model = LinkModel::load(&runtime, &name, &file)?;
             found.get_or_init(|| model.surroundings.clone());
-            model.run(&[warm_up(model.surroundings.features)])?;
+            model.warm_up()?;
             Ok(model)
         })?;
         Ok(Self {
@@ -203,13 +211,14 @@ fn check(request: &LinkRequest, features: Features) -> Result<(), InferError> {
     Err(InferError::Request { model: MODEL, reason })
 }
 
-fn warm_up(features: Features) -> LinkRequest {
+/// As many tracks as pairs.
+fn warm_up(features: Features, count: usize) -> LinkRequest {
     LinkRequest {
         features,
-        histories: vec![0.0; HISTORY * features.step()],
-        lengths: vec![1],
-        candidates: vec![0.0; features.candidate()],
-        pairs: vec![crate::track::Pair { track: 0, detection: 0 }],
+        histories: vec![0.0; count * HISTORY * features.step()],
+        lengths: vec![1; count],
+        candidates: vec![0.0; count * features.candidate()],
+        pairs: vec![crate::track::Pair { track: 0, detection: 0 }; count],
     }
 }
 
@@ -217,6 +226,8 @@ fn warm_up(features: Features) -> LinkRequest {
 pub(super) struct LinkModel {
     session: Session,
     pub(super) surroundings: Surroundings,
+    /// Whether tracks and pairs are filled up to powers of two: a GPU prepares itself anew for every shape.
+    filled: bool,
     /// The joined request of a batch.
     joined: LinkRequest,
     pair_track: Vec<i64>,
@@ -256,10 +267,19 @@ impl LinkModel {
         Ok(Self {
             session,
             surroundings,
+            filled: runtime.provider != Provider::Cpu,
             joined: LinkRequest::default(),
             pair_track: vec![],
             last: Duration::ZERO,
         })
+    }
+
+    /// Runs what will be run, so that the first request does not pay for what is made lazily.
+    pub(super) fn warm_up(&mut self) -> Result<(), InferError> {
+        let most = if self.filled { WARM } else { 1 };
+        let mut counts = successors(Some(1), |count| (*count < most).then_some(2 * count));
+        let features = self.surroundings.features;
+        counts.try_for_each(|count| self.run(&[warm_up(features, count)]).map(drop))
     }
 
     /// What [`Linker::score`] checks.
@@ -269,9 +289,17 @@ impl LinkModel {
 
     /// Runs the joined request; `None` when ONNX Runtime gives fewer or more probabilities than pairs.
     fn probabilities(&mut self) -> ort::Result<Option<Vec<f32>>> {
-        let (tracks, pairs) = (self.joined.tracks(), self.pair_track.len());
-        let joined = &self.joined;
+        let wanted = self.pair_track.len();
         let [step, candidate] = [self.surroundings.features.step(), self.surroundings.features.candidate()];
+        let joined = &mut self.joined;
+        if self.filled {
+            let [tracks, pairs] = [joined.tracks(), wanted].map(usize::next_power_of_two);
+            joined.histories.resize(tracks * HISTORY * step, 0.0);
+            joined.lengths.resize(tracks, 1);
+            joined.candidates.resize(pairs * candidate, 0.0);
+            self.pair_track.resize(pairs, 0);
+        }
+        let (tracks, pairs) = (joined.lengths.len(), self.pair_track.len());
         let outputs = self.session.run(ort::inputs![
             "histories" => TensorRef::from_array_view(([tracks, HISTORY, step], &joined.histories[..]))?,
             "lengths" => TensorRef::from_array_view(([tracks], &joined.lengths[..]))?,
@@ -279,7 +307,7 @@ impl LinkModel {
             "pair_track" => TensorRef::from_array_view(([pairs], &self.pair_track[..]))?,
         ])?;
         let (_, values) = outputs[OUTPUT].try_extract_tensor::<f32>()?;
-        Ok((values.len() == pairs).then(|| values.to_vec()))
+        Ok((values.len() == pairs).then(|| values[..wanted].to_vec()))
     }
 }
 
@@ -370,6 +398,14 @@ mod tests {
             }
         }
         assert!((together[0][0] - together[0][1]).abs() > 1e-4, "the tracks differ: {together:?}");
+        // As for a GPU, whose tensors have a few shapes only.
+        model.filled = true;
+        model.warm_up().expect("every size");
+        let filled = model.run(&requests).expect("probabilities");
+        for (a, b) in together.iter().flatten().zip(filled.iter().flatten()) {
+            assert!((a - b).abs() < 1e-6, "{together:?}, filled up {filled:?}");
+        }
+        assert_eq!(filled.iter().map(Vec::len).collect::<Vec<_>>(), [4, 0, 1, 0, 2]);
         assert_eq!(model.run(&[LinkRequest::default()]).expect("nothing"), [vec![0f32; 0]]);
     }
 }

@@ -3,18 +3,21 @@
 
 mod batcher;
 pub mod bench;
+mod config;
 mod error;
 mod graph;
 mod linker;
 mod manifest;
 mod models;
 mod picture;
+pub mod rates;
 mod runtime;
 mod scale;
 #[cfg(test)]
 pub(crate) mod testing;
 
 pub use batcher::{Arrangement, BatchModel, BatchStats, Batcher, Observer};
+pub use config::ModelConfig;
 pub use error::InferError;
 pub use linker::Linker;
 pub use manifest::{

@@ -88,7 +88,7 @@ fn wrong_settings_are_told_before_anything_starts() {
         (vec!["--camera", "good=rtsp://u:hunter2@host/x"], vec!["two cameras are named \"good\""]),
         (vec!["--camera", &missing], vec!["camera \"a\"", "missing.mp4"]),
         (vec!["--max-cameras", "0"], vec!["max_cameras is 0"]),
-        (vec!["--threads", "0"], vec!["threads is 0"]),
+        (vec!["--threads", "0"], vec!["models.threads: 0 is none", "at least 1"]),
         (vec!["--provider", "gpu"], vec!["provider", "\"gpu\"", "auto, cpu, cuda, tensorrt"]),
         (vec!["--listen", "localhost"], vec!["--listen", "localhost"]),
         (

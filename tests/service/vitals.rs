@@ -23,11 +23,14 @@ impl Vitals {
     }
 }
 
-/// Least squares of (x, y), in y an x.
+/// Least squares of (x, y), in y an x, and the standard error of it.
 #[allow(dead_code, reason = "not every user looks at slopes")]
-pub fn slope(looks: &[(f64, f64)]) -> f64 {
+pub fn slope(looks: &[(f64, f64)]) -> (f64, f64) {
     let n = looks.len() as f64;
     let mean = |of: &dyn Fn(&(f64, f64)) -> f64| looks.iter().map(of).sum::<f64>() / n;
     let (x, y) = (mean(&|look| look.0), mean(&|look| look.1));
-    mean(&|look| (look.0 - x) * (look.1 - y)) / mean(&|look| (look.0 - x).powi(2))
+    let variance = mean(&|look| (look.0 - x).powi(2));
+    let slope = mean(&|look| (look.0 - x) * (look.1 - y)) / variance;
+    let rest = mean(&|look| (look.1 - y - slope * (look.0 - x)).powi(2));
+    (slope, (rest / (n - 2.0) / variance).sqrt())
 }

@@ -3,6 +3,7 @@
 use std::io::{BufRead, BufReader, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream};
 use std::path::PathBuf;
+use std::process::{Command, Stdio};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -11,11 +12,12 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
 use super::super::models::ModelArgs;
+use super::frames_per_second;
 use super::pipeline::{decode, frame_work};
 use super::scrape::Scrape;
 use super::served::Served;
 use crate::config::ModelConfig;
-use crate::infer::bench::models_alone;
+use crate::infer::bench::{AloneReport, models_alone, models_at_pace};
 use crate::ingest::testcam::{TestCamera, TestCameraConfig};
 
 /// The service is a process of its own, as `gakp serve` starts it; every camera shows the same video over RTSP. Cameras are
@@ -36,6 +38,10 @@ pub struct Args {
     /// Ends when 95 of 100 messages do not come within so many milliseconds of the capture.
     #[arg(long, default_value_t = 200.0, value_name = "MS")]
     within: f64,
+    /// Command of a peer that tracks one camera, `$URL`, until it ends, and prints `X frames/s`; run by the shell, one
+    /// process a camera, of more and more at a time.
+    #[arg(long, value_name = "COMMAND")]
+    peer: Option<String>,
     /// Print JSON.
     #[arg(long)]
     json: bool,
@@ -63,6 +69,8 @@ struct Row {
     latency_ms: Quantiles,
     /// Time of all cores a tracked frame.
     cpu_ms: f64,
+    /// The same by what the threads do.
+    work_ms: Vec<(&'static str, f64)>,
     /// MB (of 10^6 bytes).
     resident_mb: f64,
     /// By stage, from the service's histograms.
@@ -79,7 +87,11 @@ struct Report {
     /// What the models alone would take.
     models_cameras: f64,
     models_fps: f64,
+    /// Most cameras of those tried with which the peer keeps up.
+    peer_cameras: Option<usize>,
     models_cpu_ms: f64,
+    /// The same with one camera's frames as they come, on one thread.
+    models_at_pace_cpu_ms: f64,
 }
 
 /// Runs the command.
@@ -92,8 +104,13 @@ pub fn run(args: Args) -> Result<()> {
     let video = args.video.to_str().context("the video's name is not UTF-8")?;
     let work = frame_work(&decode(video)?, &settings)?;
     let alone = models_alone(&settings, &work, work.len())?;
+    let interval = Duration::from_secs_f64(1.0 / args.fps);
+    let paced = (args.seconds as f64 * args.fps).ceil() as usize;
+    let paced = models_at_pace(&settings, &work, paced, interval)?;
     drop(work);
-    let models_cpu = (alone.detect + alone.reid + alone.link).as_secs_f64() * 1e3 / alone.frames as f64;
+    let cpu_ms = |report: &AloneReport| {
+        (report.detect + report.reid + report.link).as_secs_f64() * 1e3 / report.frames as f64
+    };
     let models_fps = alone.frames_per_second();
 
     let config = TestCameraConfig { fps: Some(args.fps), ..TestCameraConfig::new(&args.video) };
@@ -104,8 +121,7 @@ pub fn run(args: Args) -> Result<()> {
         println!("cameras  frames/s  tracked    p50    p95    p99  CPU a frame  resident MB");
     }
     let (mut rows, mut added) = (Vec::<Row>::new(), 0);
-    for count in (0..).map(|step| if step < 4 { 1 << step } else { 4 * (step - 1) }) {
-        let count = count.min(args.most);
+    for count in counts(args.most) {
         while added < count {
             service.add(&format!("camera-{added}"), &camera.url())?;
             added += 1;
@@ -123,10 +139,13 @@ pub fn run(args: Args) -> Result<()> {
         }
         let well = is_well(&row, args.within);
         rows.push(row);
-        if !well || count == args.most {
+        if !well {
             break;
         }
     }
+    drop(service);
+    let peer = |command: &str| peer_cameras(command, &args);
+    let peer_cameras = args.peer.as_deref().map(peer).transpose()?;
     let good = rows.iter().filter(|row| is_well(row, args.within)).map(|row| row.cameras);
     let report = Report {
         video: args.video,
@@ -134,7 +153,9 @@ pub fn run(args: Args) -> Result<()> {
         cameras: good.max().unwrap_or(0),
         models_cameras: models_fps / args.fps,
         models_fps,
-        models_cpu_ms: models_cpu,
+        peer_cameras,
+        models_cpu_ms: cpu_ms(&alone),
+        models_at_pace_cpu_ms: cpu_ms(&paced),
         rows,
     };
     if args.json {
@@ -143,6 +164,41 @@ pub fn run(args: Args) -> Result<()> {
         print(&report, args.within);
     }
     Ok(())
+}
+
+/// Numbers of cameras to try, up to `most`: 1, 2, 4, 8, 12, 16 and so on.
+fn counts(most: usize) -> impl Iterator<Item = usize> {
+    let steps = (0..).map(|step| if step < 4 { 1 << step } else { 4 * (step - 1) });
+    steps.take_while(move |count| *count < most).chain([most])
+}
+
+/// Most cameras of those tried with which the peer keeps up.
+fn peer_cameras(command: &str, args: &Args) -> Result<usize> {
+    let config =
+        TestCameraConfig { fps: Some(args.fps), looped: false, ..TestCameraConfig::new(&args.video) };
+    let camera = TestCamera::start(config)?;
+    let mut most = 0;
+    for count in counts(args.most) {
+        let start = |_| {
+            Command::new("sh").args(["-c", command]).env("URL", camera.url()).stdout(Stdio::piped()).spawn()
+        };
+        let peers =
+            (0..count).map(start).collect::<std::io::Result<Vec<_>>>().context("cannot run the peer")?;
+        let mut slowest = f64::INFINITY;
+        for peer in peers {
+            let output = peer.wait_with_output()?;
+            ensure!(output.status.success(), "the peer failed ({})", output.status);
+            slowest = slowest.min(frames_per_second(&String::from_utf8_lossy(&output.stdout))?);
+        }
+        if !args.json {
+            println!("peer, {count} cameras: {slowest:.2} frames/s of the slowest");
+        }
+        if slowest < TRACKED * args.fps {
+            break;
+        }
+        most = count;
+    }
+    Ok(most)
 }
 
 fn is_well(row: &Row, within: f64) -> bool {
@@ -157,12 +213,20 @@ fn print(report: &Report, within: f64) {
     for (stage, [p50, p95, p99]) in &first.stages_ms {
         println!("  {stage:40}  {p50:5.1}  {p95:5.1}  {p99:5.1}");
     }
-    println!(
-        "CPU of a frame with one camera {:.2} ms, of the models alone {:.2} ms: {:.2} times",
-        first.cpu_ms,
-        report.models_cpu_ms,
-        first.cpu_ms / report.models_cpu_ms
-    );
+    println!("CPU of a frame of one camera, ms");
+    for (work, ms) in &first.work_ms {
+        println!("  {work:40}  {ms:5.2}");
+    }
+    println!("  {:40}  {:5.2}", "all", first.cpu_ms);
+    for (how, ms) in
+        [("at this pace", report.models_at_pace_cpu_ms), ("frame after frame", report.models_cpu_ms)]
+    {
+        let times = first.cpu_ms / ms;
+        println!(
+            "  {:40}  {ms:5.2}  of it the service takes {times:.2} times",
+            format!("the models alone, {how}")
+        );
+    }
     if let Some(last) = report.rows.iter().rfind(|row| row.cameras > 1 && is_well(row, within)) {
         let each = (last.resident_mb - first.resident_mb) / (last.cameras - 1) as f64;
         println!("memory with one camera {:.0} MB, each further {each:.1} MB", first.resident_mb);
@@ -174,6 +238,12 @@ fn print(report: &Report, within: f64) {
         report.models_fps,
         report.models_cameras
     );
+    if let Some(peer) = report.peer_cameras {
+        let times = report.cameras as f64 / peer as f64;
+        println!(
+            "with how many cameras the peer keeps up: {peer}; the service takes {times:.1} times as many"
+        );
+    }
 }
 
 /// The service as it is, once the cameras have settled.
@@ -181,9 +251,10 @@ fn measure(service: &Served, cameras: usize, window: Duration) -> Result<Row> {
     service.wait_until_live(cameras)?;
     thread::sleep(SETTLE);
     let client = Client::start(service.address)?;
-    let (before, cpu) = (Scrape::of(service)?, service.cpu()?);
+    let (before, cpu, works) = (Scrape::of(service)?, service.cpu()?, service.cpu_by_work()?);
     thread::sleep(window);
-    let (after, cpu) = (Scrape::of(service)?, service.cpu()? - cpu);
+    let (cpu, now) = (service.cpu()? - cpu, service.cpu_by_work()?);
+    let after = Scrape::of(service)?;
     let mut latencies = client.stop()?;
     ensure!(!latencies.is_empty(), "no message came within {} s", window.as_secs());
     latencies.sort_by(f64::total_cmp);
@@ -191,12 +262,20 @@ fn measure(service: &Served, cameras: usize, window: Duration) -> Result<Row> {
     let more = |name: &str| after.sum(name) - before.sum(name);
     let (came, tracked) = (more("gakp_frames_in_total"), more("gakp_frames_tracked_total"));
     let stages = after.stages_since(&before);
+    let a_frame = |time: Duration| time.as_secs_f64() * 1e3 / tracked.max(1.0);
+    let since = |work: &'static str, time: Duration| {
+        time.saturating_sub(works.get(work).copied().unwrap_or_default())
+    };
+    let mut work_ms: Vec<_> =
+        now.into_iter().map(|(work, time)| (work, a_frame(since(work, time)))).collect();
+    work_ms.sort_by(|a, b| b.1.total_cmp(&a.1));
     Ok(Row {
         cameras,
         fps: tracked / window.as_secs_f64(),
         tracked: tracked / came.max(1.0),
         latency_ms: [0.5, 0.95, 0.99].map(at),
-        cpu_ms: cpu.as_secs_f64() * 1e3 / tracked.max(1.0),
+        cpu_ms: a_frame(cpu),
+        work_ms,
         resident_mb: service.resident()?,
         stages_ms: stages,
     })
@@ -246,4 +325,17 @@ impl Client {
 fn age(at: SystemTime, captured: Timestamp) -> f64 {
     let at = at.duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as i128;
     (at - captured.as_nanosecond()) as f64 * 1e-6
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn more_and_more_cameras_up_to_the_most() {
+        let all = |most| counts(most).collect::<Vec<_>>();
+        assert_eq!(all(1), [1]);
+        assert_eq!(all(3), [1, 2, 3]);
+        assert_eq!(all(18), [1, 2, 4, 8, 12, 16, 18]);
+    }
 }

@@ -10,7 +10,7 @@ use super::super::models::ModelArgs;
 use super::crowd;
 use super::{run_peer, spread};
 use crate::chart::{Line, Panel, svg};
-use crate::config::ModelConfig;
+use crate::infer::ModelConfig;
 use crate::infer::bench::LinkAlone;
 use crate::mot::{Sequence, SequenceInfo};
 use crate::track::{Association, FrameInput, LinkRequest, Tracker, TrackerConfig};

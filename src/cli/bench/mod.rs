@@ -4,6 +4,8 @@
 mod cameras;
 mod core;
 mod crowd;
+mod inference;
+#[cfg(feature = "service")]
 mod pipeline;
 #[cfg(all(feature = "service", feature = "testcam"))]
 mod scrape;
@@ -24,7 +26,10 @@ pub struct Args {
 /// What to measure.
 #[derive(Clone, Debug, clap::Subcommand)]
 enum What {
+    /// Each model by itself: its rate against the batch, and how much of it is ONNX Runtime's.
+    Inference(inference::Args),
     /// The whole offline run against the models alone on the same frames, and against a peer.
+    #[cfg(feature = "service")]
     Pipeline(pipeline::Args),
     /// The tracker alone on detections from files, one thread, by part, and against peers.
     Core(core::Args),
@@ -39,6 +44,8 @@ enum What {
 /// What is measured, or a peer, fails.
 pub fn run(args: Args) -> Result<()> {
     match args.what {
+        What::Inference(args) => inference::run(args),
+        #[cfg(feature = "service")]
         What::Pipeline(args) => pipeline::run(args),
         What::Core(args) => core::run(args),
         #[cfg(all(feature = "service", feature = "testcam"))]
@@ -56,6 +63,14 @@ fn run_peer(command: &str) -> Result<String> {
         String::from_utf8_lossy(&output.stderr).trim()
     );
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+}
+
+/// The first `X frames/s` in what a peer printed.
+#[cfg(feature = "service")]
+fn frames_per_second(text: &str) -> Result<f64> {
+    let words: Vec<&str> = text.split_whitespace().collect();
+    let fps = words.windows(2).find(|w| w[1] == "frames/s").and_then(|w| w[0].parse().ok());
+    fps.with_context(|| format!("the peer printed no `X frames/s`: {}", text.trim()))
 }
 
 /// Median, least and most.

@@ -9,7 +9,7 @@ use serde::Serialize;
 
 use super::super::models::ModelArgs;
 use super::super::track::{Job, Output, track_video};
-use super::{run_peer, spread};
+use super::{frames_per_second, run_peer, spread};
 use crate::config::{ModelConfig, TrackerOptions};
 use crate::infer::bench::{AloneReport, FrameWork, models_alone};
 use crate::infer::{ModelSettings, Models};
@@ -77,6 +77,7 @@ pub fn run(args: Args) -> Result<()> {
     let settings = ModelConfig::from(args.models).settings()?;
     let frames = decode(&args.video)?;
     let work = frame_work(&frames, &settings)?;
+    let peer = |command: &str| frames_per_second(&run_peer(command)?);
     let job = Job {
         tracker: TrackerOptions::default(),
         models: settings.clone(),
@@ -96,7 +97,7 @@ pub fn run(args: Args) -> Result<()> {
                 work.len()
             );
             let whole = tracked.frames as f64 / tracked.seconds;
-            Ok(Round { whole, alone, peer: args.peer.as_deref().map(peer_fps).transpose()? })
+            Ok(Round { whole, alone, peer: args.peer.as_deref().map(peer).transpose()? })
         })
         .collect::<Result<Vec<_>>>()?;
     let report = report(args.video, &rounds);
@@ -167,14 +168,6 @@ pub(super) fn frame_work(frames: &[(Image, MediaTime)], settings: &ModelSettings
     }
     models.shutdown();
     Ok(work)
-}
-
-/// The first `X frames/s` that a peer prints.
-fn peer_fps(command: &str) -> Result<f64> {
-    let text = run_peer(command)?;
-    let words: Vec<&str> = text.split_whitespace().collect();
-    let fps = words.windows(2).find(|w| w[1] == "frames/s").and_then(|w| w[0].parse().ok());
-    fps.with_context(|| format!("the peer printed no `X frames/s`: {}", text.trim()))
 }
 
 fn report(video: String, rounds: &[Round]) -> Report {

@@ -1,5 +1,6 @@
 //! A service of one's own, as a process, for benchmarks.
 
+use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::PathBuf;
@@ -100,13 +101,22 @@ impl Served {
         bail!("not all of the {cameras} cameras are live within {} s", PATIENCE.as_secs())
     }
 
-    /// Time that it has had of all cores (`man 5 proc`, `/proc/PID/stat`).
+    /// Time that it has had of all cores.
     pub fn cpu(&self) -> Result<Duration> {
-        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.child.id()))?;
-        // After the name, which may hold anything: user and system time are the 12th and 13th, in hundredths.
-        let (_, rest) = stat.rsplit_once(") ").context("/proc/PID/stat")?;
-        let ticks = rest.split(' ').skip(11).take(2).map(str::parse::<u64>).sum::<Result<u64, _>>()?;
-        Ok(Duration::from_millis(10 * ticks))
+        cpu_of(&format!("/proc/{}/stat", self.child.id()))
+    }
+
+    /// The same of each thread that lives, by what it does. Threads that have ended are in [`Served::cpu`] alone.
+    pub fn cpu_by_work(&self) -> Result<BTreeMap<&'static str, Duration>> {
+        let mut sums = BTreeMap::new();
+        for task in std::fs::read_dir(format!("/proc/{}/task", self.child.id()))? {
+            let task = task?.path();
+            // It may have ended meanwhile.
+            let Ok(name) = std::fs::read_to_string(task.join("comm")) else { continue };
+            let Ok(cpu) = cpu_of(&task.join("stat").to_string_lossy()) else { continue };
+            *sums.entry(work_of(name.trim())).or_default() += cpu;
+        }
+        Ok(sums)
     }
 
     /// Resident memory, MB (of 10^6 bytes).
@@ -116,6 +126,31 @@ impl Served {
         let kilobytes: f64 = line.trim().trim_end_matches(" kB").parse()?;
         Ok(kilobytes * 1024e-6)
     }
+}
+
+/// Of a process or a thread (`man 5 proc`, `/proc/PID/stat`).
+fn cpu_of(stat: &str) -> Result<Duration> {
+    let stat = std::fs::read_to_string(stat)?;
+    // After the name, which may hold anything: user and system time are the 12th and 13th, in hundredths.
+    let (_, rest) = stat.rsplit_once(") ").context("/proc/PID/stat")?;
+    let ticks = rest.split(' ').skip(11).take(2).map(str::parse::<u64>).sum::<Result<u64, _>>()?;
+    Ok(Duration::from_millis(10 * ticks))
+}
+
+/// What a thread of this name does.
+fn work_of(name: &str) -> &'static str {
+    let works = [
+        ("detect-", "detector"),
+        ("reid-", "appearance"),
+        ("link-", "link scorer"),
+        ("tracker", "tracker"),
+        ("async", "stages and API"),
+        // GStreamer's queue before the decoder.
+        ("queue", "decoder"),
+        ("sqlx-", "history"),
+    ];
+    // The rest is GStreamer's and the camera's own: sockets, RTP, the jitter buffer.
+    works.iter().find(|(prefix, _)| name.starts_with(prefix)).map_or("receiving", |(_, work)| work)
 }
 
 impl Drop for Served {
